@@ -230,13 +230,13 @@ class Trial:
         if session.testsfailed:
             return None
         self.session, self.items = session, {item.nodeid: item for item in session.items}
-        self.imported = lines_of(self.arcs)
+        self.imported = lines_of(self.arcs)  # so far only collecting has run
         self.passed.write_text("{}")
         forked(lambda: self.passed.write_text(json.dumps(self.run_rows(list(self.items), stop=False))))
         sys.settrace(None)
         threading.settrace(None)
         self.read_rows()
-        gc.unfreeze()
+        gc.unfreeze()  # get_objects leaves out what tests/conftest.py has frozen
         for function in gc.get_objects():
             if isinstance(function, FunctionType) and function.__name__ != "<lambda>":  # of which a line may have two
                 code = function.__code__
@@ -371,7 +371,9 @@ def compare(before: Iterable[str], after: Iterable[str]) -> int:
 
 def spare(results: Iterable[Iterable[str]]) -> int:
     """Print the test functions that can be removed together: others cover all their arcs and kill all their mutants."""
-    needs = [{name.partition("[")[0] for name in json.loads(line)["killers"]} for lines in results for line in lines]
+    records = (json.loads(line) for lines in results for line in lines)
+    # for each arc and each mutant: the functions that are left to cover or kill it
+    needs = [{name.partition("[")[0] for name in record["killers"]} for record in records]
     counts = Counter(itertools.chain.from_iterable(needs))
     for function in sorted(counts, key=lambda function: (counts[function], function)):
         having = [need for need in needs if function in need]

@@ -40,7 +40,7 @@ def schema_text() -> str:
 
 
 def _complete(definition: dict[str, Any], kind: type[Section]) -> None:
-    """Allow comments and retired keys; set each section's default to the defaults of its keys."""
+    """Add choices, lists as one line, comments and retired keys; drop defaults of sections, whose keys have them."""
     properties = definition["properties"]
     for field in fields(kind):
         choices = [choice for meta in unwrap(field.type)[1] for choice in (meta.extra or {}).get("choices", ())]

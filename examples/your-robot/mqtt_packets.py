@@ -74,9 +74,9 @@ class Reader:
         return self.skipped == 0
 
     def skip_long_topic(self, start, size):
-        """Skip the topic of a message if its number, which must be acknowledged, would otherwise be cut off.
+        """Skip a topic so long that the packet's number behind it would be cut off; return True if it is skipped.
 
-        Return True if it is skipped. No topic of ours is so long: what is left is a message with an empty topic.
+        The number must be acknowledged. So the packet goes on as one with an empty topic: no topic of ours is so long.
         """
         topic_size = struct.unpack_from("!H", self.data, start)[0]
         if 2 + topic_size + 2 <= LONGEST:

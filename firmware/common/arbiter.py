@@ -66,11 +66,13 @@ class Arbiter:
             self.bar(run - 1 or LAST_RUN)
         if self.latch.latched:
             self.bar(run)
+        # after a reset the latch waits for a zero: not that of a client without control
         if (moves or ours) and self.latch.refuses(moves, run != PERSON, now):
             return REFUSED
         limit = self._watchdog_ms if valid_ms < 0 or valid_ms > self._watchdog_ms else int(valid_ms)
         if run == PERSON:
             self._take(moves, valid_ms == 0 or not ours, now)
+        # people first; and not before scripts may run, nor of a run that is barred
         elif self._held or self._starting or (run > 0 and not newer(run, self.barred)):
             return REFUSED
         else:
@@ -102,9 +104,10 @@ class Arbiter:
                 self.bar(self._newest)
 
     def _take(self, moves: bool, final: bool, now: int) -> None:
-        """Handle a person's command: scripts wait, or end.
+        """Handle a person's command: scripts wait, or end. ``final``: a zero ends them in any case.
 
-        After a person's first command no script is in effect: a zero then ends the person's own driving.
+        Another zero ends a script only if that was in effect, which none is after the person's first command: then it
+        ends only the person's own driving.
         """
         if not moves and (final or self._scripted):
             self.bar(self._newest)

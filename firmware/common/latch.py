@@ -68,6 +68,7 @@ class Latch:
             place = self.recent.index(name)
             if by and self.client[place] == "?":
                 self.client[place] = sender
+            # the newest stop, of a sender that was not checked, comes again from one that was
             if name == self.recent[0] and by and self.by[-1:] == "?" and by[-1] != "?":
                 self.by = by
             return False

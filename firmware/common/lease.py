@@ -7,7 +7,11 @@ A client is ``(account, id, by, device)``, known by the first two; the account i
 
 
 class Lease:
-    """A lease. Pass requests to ``hold`` and ``release``, drive commands to ``refuses``; call ``tick`` regularly."""
+    """A lease. Pass requests to ``hold`` and ``release``, drive commands to ``refuses``; call ``tick`` regularly.
+
+    A holder drives until 5 s after it got control or last moved something; after that a request gets control at once.
+    ``others``: commands without a key.
+    """
 
     def __init__(self, now: int, diff, random, strangers: int) -> None:
         """Store the arguments; ``random(4)`` returns 8 hex digits.
@@ -29,7 +33,7 @@ class Lease:
         self._held = False  # in the last 5 s the holder moved something: others have to ask
 
     def hold(self, client: tuple, ms: int, urgent: bool, now: int) -> None:
-        """Give control, renew it, or note the request for it. ``urgent``: do not ask its holder."""
+        """Give control, renew it, or note the request for it while another client drives; ``urgent``: not then."""
         self.tick(now)
         ms = min(max(ms, 1000), 10_000)
         if client[:2] == self.holder[:2]:
@@ -80,7 +84,10 @@ class Lease:
         return False
 
     def tick(self, now: int) -> None:
-        """End control and requests whose time is over. Call it at least every few minutes, as clocks of boards wrap."""
+        """End control and requests whose time is over; pass control on to a client that asks once the holder rests.
+
+        Call it at least every few minutes, as clocks of boards wrap.
+        """
         diff = self._diff
         if self.others and diff(now, self._received) >= 2000:
             self.others = False

@@ -71,6 +71,10 @@ def parse(raw: memoryview | bytes, grouped: bool = False) -> tuple[float, float,
 
 
 def _run(body: dict, stops: bool) -> int:
+    """Return the number of the script's run, PERSON or UNKNOWN_RUN; ``stops``: all axes are 0.
+
+    Raises ValueError for what is wrong in a command that moves anything.
+    """
     source = body.get("source")
     run = body.get("run")
     if run is not None and not (type(run) is int and 1 <= run <= LAST_RUN):
@@ -87,6 +91,7 @@ def _run(body: dict, stops: bool) -> int:
 
 
 def _valid_ms(body: dict, stops: bool) -> int:
+    """Return the limit in the command; -1: there is none, or a wrong one in a zero. Raises ValueError, as _run."""
     value = body.get("valid_ms")
     if value is not None:
         if type(value) in (int, float) and 0 <= value < 1e12 and (stops or value >= 1):

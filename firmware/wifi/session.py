@@ -66,6 +66,7 @@ class Session:
         connection = self.connection
         due = connection.step(now, server != "")
         if due == "drop":
+            # silence, although bytes came: the answer to the ping is behind a flood
             self._paused = connection.reason == "silence" and diff(now, self._received) < 500
             raise OSError(connection.reason)
         if due == "resolve":
@@ -155,12 +156,12 @@ class Session:
         """Write waiting bytes, if that is ``urgent`` or the last write was long enough ago."""
         client = self.client
         if self._paused and self.connection.state == "online" and diff(now, self._since) >= _CALM_MS:
-            self._paused = False
+            self._paused = False  # the flood is over
             client.subscribe(len(client.topics))
         if not urgent and diff(now, self._wrote) < _PACE_MS and client.waiting < len(client.out) // 2:
             return
         if client.waiting and not self._asked and self.connection.state == "online":
-            self._asked = client.send(0xC0)
+            self._asked = client.send(0xC0)  # a ping: its answer shows that all writes before it have arrived
             self._behind = -1  # the write with the ping itself does not count
         self._wrote = now
         assert self._open

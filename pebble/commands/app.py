@@ -105,23 +105,23 @@ class _Listed(TyperCommand):
         return command.make_context(info_name, args, parent, **extra)
 
     def _command(self, arguments: list[str]) -> Any:
-        """Return the command that ``arguments`` follow; with a subcommand of the table, the group that has it."""
-        below: dict[str, Any] = {
+        """Return the loaded command; if ``arguments`` begin with a subcommand of the table, the group of those."""
+        listed: dict[str, Any] = {
             words.split()[1]: _Listed(words, self._offered)
             for words in self._offered
             if words.startswith(f"{self._words} ")
         }
-        if arguments and arguments[0] in below:
-            return TyperGroup(name=self.name, commands=below, rich_markup_mode=None)
+        if arguments and arguments[0] in listed:
+            return TyperGroup(name=self.name, commands=listed, rich_markup_mode=None)
         loaded, name = part(self._offered[self._words].place), str(self.name)
         app = typer.Typer(rich_markup_mode=None)
-        if hasattr(loaded, "register"):
+        if hasattr(loaded, "register"):  # a module, whose command has subcommands
             loaded.register(app)
         else:
             app.command(name)(loaded)
         command = typer.main.get_group(app).commands[name]
         if isinstance(command, TyperGroup):
-            command.commands.update(below)
+            command.commands.update(listed)
         return command
 
 

@@ -28,7 +28,7 @@ class Pipes:
         self._output = BoundedOutput(on_line, LINE_LIMIT, reactor.now(), rate=rate)
         self._notes = LineSplitter(LINE_LIMIT, truncate=True)
         self._pause: Timer | None = None  # until the output of a child that floods is read again
-        self._tick: Timer | None = None
+        self._tick: Timer | None = None  # while the number of dropped lines has still to be passed on
         self._watch_output()
         reactor.watch(child.notes, self._read_notes)
 
@@ -61,11 +61,11 @@ class Pipes:
                 self._reactor.forget(self._child.output)
                 self._pause = self._reactor.after(PAUSE_S, self._watch_output)
             if self._output.waits and self._tick is None:
-                self._tick = self._reactor.after(_TICK_S, self._say)
+                self._tick = self._reactor.after(_TICK_S, self._say_dropped)
 
-    def _say(self) -> None:
+    def _say_dropped(self) -> None:
         self._output.tick(self._reactor.now())
-        self._tick = self._reactor.after(_TICK_S, self._say) if self._output.waits else None
+        self._tick = self._reactor.after(_TICK_S, self._say_dropped) if self._output.waits else None
 
     def _read_notes(self) -> None:
         data = read_available(self._child.notes)

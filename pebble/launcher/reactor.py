@@ -63,7 +63,7 @@ class Reactor:
     def run_until(self, condition: Callable[[], bool], timeout: float | None = None) -> bool:
         """Run jobs until ``condition()`` is true; return False if ``timeout`` seconds pass first."""
         end = None if timeout is None else self.now() + timeout
-        self._read_at = self._clock()
+        self._read_at = self._clock()  # what passed before is no stall
         try:
             while not condition():
                 now = self.now()

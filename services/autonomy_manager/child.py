@@ -154,7 +154,7 @@ def _check_program(path: Path) -> None:
 
 
 def _read(pipe: int, output: BoundedOutput) -> bool:
-    """Read the available output; return False at its end, or if there is none."""
+    """Read the available output; return False if nothing was available, or at the end of the pipe."""
     try:
         data = os.read(pipe, _READ_BYTES)
     except BlockingIOError:

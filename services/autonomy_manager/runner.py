@@ -82,7 +82,7 @@ class Runner:
 
     @property
     def stoppable(self) -> Run | None:
-        """The run that a stop must end; None if none can move the robot, or the only one is being ended already."""
+        """The run that a stop must end, or whose successor it must cancel; None if none may move the robot."""
         if not self.drives:
             return None
         return self.active if self._next is None else self._run
@@ -148,8 +148,8 @@ class Runner:
             self._run = run = Run(number, plan, baseline)
             self._service.halt(number)  # now the motor owner knows the run, so a person can stop it before it drives
             for step in plan.dependencies:
-                run.dependencies.append(self._started(run, step))
-            run.main = self._started(run, plan.main)
+                run.dependencies.append(self._start_part(run, step))
+            run.main = self._start_part(run, plan.main)
         except (OSError, ValueError, PebbleError) as error:
             self.error, self.stopped = f"Failed to start {script.label}: {error}", isinstance(error, StoppedError)
             log.warning("%s", self.error)
@@ -157,7 +157,8 @@ class Runner:
             return
         log.info("started %s, run %d, pid %d", script.file, number, run.main.child.pid)
 
-    def _started(self, run: Run, step: Step) -> Part:
+    def _start_part(self, run: Run, step: Step) -> Part:
+        """Start one process of ``run``: a script that the main one needs, or the main one."""
         script = step.script
         path = str(self._service.config_path)
         variables = {CONFIG: path}

@@ -81,10 +81,10 @@ class AutonomyManager(Service):
         self._runner.close(_CLOSE_S)
 
     def on_connected(self) -> None:
-        if not self._connected_before:  # a predecessor may have been killed together with its script
+        if not self._connected_before:
             self._connected_before = True
             self.listen(CONTROL_STATE, self._control)
-            try:
+            try:  # a predecessor may have been killed with its script: a zero of a newer run bars that
                 self.halt(next_run(self.config, self._owners.barred))
             except PebbleError as error:
                 self.log.error("%s", error)
@@ -157,7 +157,7 @@ class AutonomyManager(Service):
         run, stopped = self._runner.stoppable, bool(self._owners.refusal)
         if run is not None and (why := self._owners.ending(run.number, run.baseline, self._signs)):
             self._runner.stop(why, stopped=stopped)
-        if self._runner.stopped and not stopped:
+        if self._runner.stopped and not stopped:  # it was reset: scripts may start again
             self._runner.refuse(None)
 
     def _control(self, state: ControlState, owner: str) -> None:
@@ -167,7 +167,7 @@ class AutonomyManager(Service):
     def drive(self, drive: Drive, _arrived: float) -> None:
         """Handle a drive command, on the transport's thread.
 
-        Commands of unsigned scripts and of people without a key look alike.
+        While an unsigned script runs, its commands and those of people without a key look alike: neither ends it.
         """
         if drive.signed:
             if isinstance(drive.run, int):
@@ -230,8 +230,8 @@ class AutonomyManager(Service):
             self._local.release()
             raise
         self._signs, self._unsigned_moves = plan.main.script.ours, False
-        for step in self._owners.steps_to(run):
-            self.halt(step)
+        for number in self._owners.steps_to(run):  # else an owner may take this run for an older one
+            self.halt(number)
         return run, self._owners.baseline()
 
     def end_run(self, run: int) -> None:
@@ -241,7 +241,7 @@ class AutonomyManager(Service):
         self._local.release()
 
     def halt(self, run: int) -> None:
-        """Stop the wheels now."""
+        """Stop the wheels now, by a zero of this run; motor owners then bar all earlier ones."""
         self.publish(DRIVE, Drive(source=SCRIPT, run=run))
         if self._unsigned_moves and not self._owners.held:  # a person with control drives: leave the wheels alone
             self._unsigned_moves = False

@@ -26,11 +26,11 @@ class JpegSplitter:
             end = _end(buffer)
             if end > 0:
                 pictures.append(bytes(buffer[:end]))
-            elif end == 0:
+            elif end == 0:  # the rest is still to come
                 if len(buffer) > self._limit:
                     buffer.clear()
                 return pictures
-            del buffer[: max(1, end)]
+            del buffer[: max(1, end)]  # of no picture only the first byte: another may begin in it
 
 
 def _end(buffer: bytearray) -> int:

@@ -162,7 +162,7 @@ class LevelControl:
         self._lost: deque[tuple[float, float]] = deque()  # when turns were lost, and how many
         self._changed_at = self._good_since = now
         self._rose_at: float | None = None  # None: nothing was restored since the last step down
-        self._patience = _MEASURE_S if level else _PATIENCE_S  # nothing has gone wrong yet
+        self._patience = _MEASURE_S if level else _PATIENCE_S  # of little load, before a step up
 
     @property
     def step(self) -> Step:

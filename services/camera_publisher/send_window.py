@@ -30,9 +30,9 @@ class SendWindow:
     Over a long round trip several frames travel at once: at first one, then one more for each that arrived promptly,
     because the capacity of the path shows only after a round trip.
 
-    If an access point delays acknowledgements, they come together: a late frame is acknowledged at once with younger
-    frames, for which a slow connection would have needed longer. This shows only while a younger frame is in flight. So
-    if the only frame is late, another is let through now and then.
+    If an access point delays acknowledgements until its next beacon, they come together: a late frame is acknowledged
+    at once with younger frames, for which a slow connection would have needed longer. This shows only while a younger
+    frame is in flight. So if the only frame is late, another is let through now and then.
     """
 
     def __init__(self) -> None:
@@ -68,9 +68,10 @@ class SendWindow:
         for frame in frames:
             began = max(frame.at + round_trip_s, self._free_at)
             self._free_at = now
-            prompt = now - frame.at - round_trip_s <= _PROMPT_S  # else fewer may be in flight
-            self._limit = max(1, min(_MOST, self._limit + (1 if prompt else -1)))
-            acknowledged.append(Acknowledged(frame.at, _credible(max(0.0, now - began), slack_s)))
+            is_prompt = now - frame.at - round_trip_s <= _PROMPT_S
+            self._limit = max(1, min(_MOST, self._limit + (1 if is_prompt else -1)))
+            took_s = max(0.0, now - began)
+            acknowledged.append(Acknowledged(frame.at, _credible(took_s, slack_s)))
         if len(frames) > 1:
             self._note_beacon(frames, since_s, now)
         return acknowledged

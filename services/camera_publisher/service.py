@@ -45,9 +45,9 @@ class CameraPublisher(Service):
         self._shape = Shape(width, height, video.rotate_degrees)
         self._sent_size: tuple[int, int] | None = None  # width and height of the last picture
         self._camera_at = now  # when its last frame came
-        self._polling = False
+        self._polling = False  # the next call of _poll is planned
         self._problem = ""  # the last one
-        self._seen = SourceCheck()
+        self._blackness = SourceCheck()
         self._meter, self._keyframes = RateMeter(), KeyframeRequests()
         self._picture_topic = self.addresses[CAMERA].topic
         self._remote = remote_transport(self.config, "camera-publisher")
@@ -115,7 +115,7 @@ class CameraPublisher(Service):
         self._rate.connection_lost()
         self._keyframes.require()
         self._meter.clear()
-        self._seen.clear()
+        self._blackness.clear()
         self._camera_at = self.clock()
         self._reader.enabled = self._remote.state is State.CONNECTED
         self._report()
@@ -152,7 +152,8 @@ class CameraPublisher(Service):
         picture = self._shape.picture(frame, self._rate.step.size)
         payload = self._encode(picture, frame.info.captured_ms)
         now = self.clock()
-        self._seen.take(_BLACK if is_black(picture) else now, now)
+        content = _BLACK if is_black(picture) else now  # only black ones count as the same
+        self._blackness.take(content, now)
         if not frame.valid():
             self._throw_away("overwritten")  # by the next frame, while it was encoded
         elif not self._remote.publish(self._picture_topic, payload, qos=QoS.LATEST):
@@ -219,7 +220,7 @@ class CameraPublisher(Service):
 
     @property
     def _black(self) -> str | None:
-        return f"shows only black since {self._seen.same_s:.0f} s" if self._seen.repeats else None
+        return f"shows only black since {self._blackness.same_s:.0f} s" if self._blackness.repeats else None
 
 
 def is_black(picture: Pixels) -> bool:

@@ -174,9 +174,9 @@ class Node:
                 self._attempt_call(self._calls.get(timeout=max(0.0, due - time.monotonic())))
 
     def _check(self) -> None:
-        """Register the node, again and again: a master that restarts has forgotten everything."""
+        """Register the node if the master does not know it, as after a restart; connect to lost publishers."""
         try:
-            self._look()
+            self._keep_registered()
             self.registered = not self._evicted
             self.problem = "" if self.registered else self.problem
         except RosError as error:
@@ -191,7 +191,7 @@ class Node:
                 if source.sock is None and not source.asked:
                     self._connect_soon(subscription, source)
 
-    def _look(self) -> None:
+    def _keep_registered(self) -> None:
         """Register what the master does not know of this node, and tell lost subscribers about it. Raises RosError."""
         publishers, subscribers, _ = call(self.master, "getSystemState", self.name)
         uri = self._uri_of(self.name)
@@ -228,7 +228,10 @@ class Node:
             return ""
 
     def _revive(self, publishers: Mapping[str, list[str]], subscribers: Mapping[str, list[str]]) -> None:
-        """Tell subscribers that are not connected about this node. They would wait for minutes after a cut."""
+        """Have subscribers that the master lists, but are not connected, told of this node every REVIVE_S.
+
+        By themselves they would wait for minutes after the network was cut.
+        """
         now = time.monotonic()
         missing: dict[tuple[str, str], float] = {}
         for topic, publication in self._publications.items():

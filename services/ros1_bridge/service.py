@@ -71,7 +71,7 @@ class Ros1Reader(Service):
 
 
 class Ros1Bridge(Ros1Reader, MotorOwner):
-    """A service that also drives the base. The multiplexer's lock follows the latch: zeros alone stop no Husky."""
+    """A service that also drives the base. A stop locks its multiplexer: at zeros alone others drive a Husky on."""
 
     name = "ros1_bridge"
     publishes = (*MotorOwner.publishes, *PUBLISHES)

@@ -49,15 +49,16 @@ class Telemetry:
         self._log = RateLimitedLog(log)
         self._due: dict[Channel, float] = {}
         self._goal: dict[str, Any] | None = None
-        self._navigates_at = float("-inf")
+        self._navigates_at = float("-inf")  # when a planner was last seen to pursue a goal
         metrics, names = self._metrics, self._names
         battery = metrics.charging_level.enabled or metrics.charging_status.enabled
-        tells = metrics.navigation_status.enabled
+        status = metrics.navigation_status.enabled
         topics: tuple[tuple[bool, str, Form, Callable[[bytes], None]], ...] = (
             (True, names.odometry_topic, messages.ODOMETRY, self._odometry),
             (battery or metrics.diagnostics.enabled, names.diagnostics_topic, messages.DIAGNOSTICS, self._diagnostics),
-            (tells or section.drives, names.navigation_status_topic, messages.GOAL_STATUS, self._status),
-            (tells or metrics.navigation_goal.enabled, names.navigation_goal_topic, messages.POSE, self._take_goal),
+            # a bridge that drives needs it as well, see navigates
+            (status or section.drives, names.navigation_status_topic, messages.GOAL_STATUS, self._status),
+            (status or metrics.navigation_goal.enabled, names.navigation_goal_topic, messages.POSE, self._take_goal),
         )
         for wanted, topic, form, read in topics:
             if wanted:

@@ -46,7 +46,7 @@ class SerialService(Service, ABC):
         self._input_lock = threading.Lock()
         self._silence, self._starts = Silence(), Starts()
         self.sensors = MovingSensors()
-        self._still = ""  # the logged problem of sensors
+        self._sensor_problem = ""  # as last logged
         self._warned_at = float("-inf")  # of a board that starts again and again
         self._holders: list[str] = []  # other programs at the device
         self._misread = False  # at the last check
@@ -131,14 +131,15 @@ class SerialService(Service, ABC):
             return
         idle, heard = now - line.output.sent_until >= CHECK_S, self._heard_since_opening()
         state, silent_ms = self._silence.check(line.state, line.opened, heard, now, idle=idle)
+        # bytes come, and no report in them is understood
         misread = silent_ms is None and line.state is LineState.READY and line.received > 0
-        still = self.sensors.problem
-        if still and not self._still:
-            self.log.warning("%s", still)
-        self._still = still
+        sensor_problem = self.sensors.problem
+        if sensor_problem and not self._sensor_problem:
+            self.log.warning("%s", sensor_problem)
+        self._sensor_problem = sensor_problem
         starts = self._starts.within_a_minute(line.opened, now)
         misread_twice = misread and self._misread  # the first time a line may be under way
-        problem = _MISREAD if misread_twice else line.problem or still
+        problem = _MISREAD if misread_twice else line.problem or sensor_problem
         self._misread = misread
         self._reported.report(state, silent_ms, problem, starts)
         if starts >= OFTEN and now - self._warned_at >= _WARN_S:

@@ -79,7 +79,8 @@ def _bridge(reader: Reader, bridge: MqttBridge, path: Path) -> MqttBridge:
     notes, remote, link = reader.notes, bridge.remote, bridge.link
     for section, instead in _INSTEAD.items():
         words = " ".join(getattr(bridge, section).command)
-        if bridge.enabled and (reasons := [reason for names, reason in _OF_ORIGINAL if names(words)]):
+        reasons = [reason for occurs_in, reason in _OF_ORIGINAL if occurs_in(words)]
+        if bridge.enabled and reasons:
             notes.warning((*path, section, "command"), f"{', and '.join(reasons)}: write `{instead}`")
     if link.kbit is not None and link.profile == "wide":
         why = 'has no effect at profile "wide": write "thin" or "auto", or leave it out'

@@ -1,4 +1,4 @@
-"""Decides which aliases of a device are in use: those that no other device claims."""
+"""Decides which aliases, extra channels of a device's interfaces, are in use: those that no other device claims."""
 
 import logging
 from collections.abc import Callable, Mapping

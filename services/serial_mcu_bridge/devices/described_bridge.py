@@ -254,7 +254,7 @@ class DescribedBridge(SerialService):
         ]
 
     def _receive_group(self, message: Message, _value: Any, _names: dict[str, str]) -> None:
-        """Take the members of a group that are for this device, to be written at once, or not at all."""
+        """Decode a group of commands, on the transport's thread."""
         try:
             members = groups.decode(message.payload)
         except PayloadError as error:
@@ -263,6 +263,7 @@ class DescribedBridge(SerialService):
         self.post_message(GROUP, partial(self._command_group, members))
 
     def _command_group(self, members: tuple[groups.Member, ...]) -> None:
+        """Write the members of a group that are for this device: all at once, or none."""
         if self.device is None:
             self._drop_command("a group of commands")
             return
@@ -351,7 +352,7 @@ class DescribedBridge(SerialService):
             self._peers.forget(uid)
         else:
             self._peers.add(uid, frozenset(claims(manifest).granted), self.clock(), retained=retained)
-            if retained:  # unless its bridge publishes it again in time, _tick removes it
+            if retained:  # ask its bridge for it; if that does not publish it again in time, _tick removes it
                 self.publish(MCU_COMMAND, {}, uid=uid, name=RESERVED)
         self.aliases.update()
         self._arm()

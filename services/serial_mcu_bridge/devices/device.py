@@ -85,11 +85,11 @@ class Device:
 
         A motion sample is stored as well, because summaries repeat the newest one.
         """
-        body = "" if route.alias is None else route.alias.body
+        has_imu_body = route.alias is not None and route.alias.body != ""  # else the alias carries the generic payload
         if route.interface.profile == imu.MOTION and imu.fits(imu.MOTION, sample.value):
             motion = self._reports.motion(sample.t, sample.seq, sample.mcu_ms, sample.value)
-            return motion if body else sample
-        if body:
+            return motion if has_imu_body else sample
+        if has_imu_body:
             return self._reports.summary(sample.t, sample.seq, sample.mcu_ms, sample.value)
         return sample
 

@@ -18,7 +18,7 @@ _WATCH_S = 0.5
 
 
 class ImuBridge(SerialService):
-    """The service of a sensor, to which it sends nothing. Drive commands tell when samples should change."""
+    """The service of a sensor, to which it sends nothing. Samples must change while drive commands move the wheels."""
 
     publishes = (IMU_FAST, IMU)
     receive_only = True

@@ -125,6 +125,6 @@ def _full_blocks(part: bytes) -> bytes:
 
 
 def _block(part: bytes) -> bytes:
-    """Return the last block of ``part``, shorter than a full one; after it comes a zero, or the end."""
+    """Return what follows the full blocks of ``part`` as a block; it also stands for the zero behind it, if any."""
     last = part[len(part) - len(part) % _BLOCK :]
     return bytes((len(last) + 1,)) + last

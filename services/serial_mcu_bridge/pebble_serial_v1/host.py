@@ -187,10 +187,12 @@ class Session:
         data, payloads = b"", [_packed(interface, values) for interface, values in wanted]
         for (interface, _), payload in zip(wanted, payloads, strict=True):
             data += self._frame(Type.CMD, wall_ms, interface.id, payload)
+            # by the number of the frame just made
             self._commands[self._sequence] = _Command(interface.name, now + ANSWER_S)
             if len(self._commands) > _OPEN_COMMANDS:
                 self._commands.popitem(last=False)
         kind = str(wanted[0][0].id) if len(wanted) == 1 else "group"
+        # a newer line replaces one of the same kind: so commands take turns in kinds, and WAITING of them can wait
         slot = self._slots[kind] = (self._slots.get(kind, 0) + 1) % WAITING
         return Send(f"command {kind}/{slot}", data)
 
