@@ -277,7 +277,7 @@ class MotorOwner(Service, ABC):
 
     @every(_CHECK_S)
     def check_subscriptions(self) -> None:
-        """Tell operators whether an emergency stop latches here: not while the broker refuses its topics.
+        """Tell operators whether an emergency stop latches here. While the broker refuses its topics, it does not.
 
         Raises TransportError while the drive topic is refused: nothing could drive this robot.
         """

@@ -31,8 +31,8 @@ class BoundedOutput:
         self._lines = LineSplitter(longest, truncate=True)
         self._tokens, self._filled_at = self._most, now  # lines that may pass now, and when that was computed
         self._newest, self._newest_at, self._repeats = b"", now, 0  # line, without its time, and its repetitions
-        self._kept: deque[bytes] = deque(maxlen=KEPT)
-        self._left_out = 0
+        self._left_out = 0  # lines that were not written yet, because too many came
+        self._kept: deque[bytes] = deque(maxlen=KEPT)  # the newest of these, which are written after all
         self._suppressed_at, self._said_at = float("-inf"), now  # when a line was left out, and when that was written
 
     @property
@@ -95,6 +95,7 @@ class BoundedOutput:
             self._kept.append(line)
 
     def _say(self) -> None:
+        """Write how many lines were left out, and then the newest of them, which were kept."""
         self._say_repeats()
         if missing := self._left_out - len(self._kept):
             self._log("WARNING", f"{missing} lines are left out: {self._rate:g} a second are logged")

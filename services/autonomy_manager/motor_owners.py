@@ -86,10 +86,11 @@ class MotorOwners:
             boot, count, barred = baseline.setdefault(owner, (state.boot, state.count, 0))
             if state.latched or (state.boot == boot and state.count != count):
                 return _stopped(owner, state)
+            # An owner bars all runs up to a number: those before one that begins, or all because a person drives.
             is_barred = state.last_barred != barred and not newer(run, state.last_barred)
             if signs and is_barred:
                 newer_began = state.last_barred != run or newer(self.newest_run, run)
-                return SUPERSEDED if newer_began else OVERRIDDEN  # a newer run bars this one by beginning
+                return SUPERSEDED if newer_began else OVERRIDDEN
             if state.boot != boot:
                 return f"motor owner {owner} was restarted: start the script again"
         return ""

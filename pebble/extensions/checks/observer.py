@@ -13,7 +13,7 @@ from pebble import contract as c
 from pebble.contract import codec
 from pebble.contract.names import with_name
 from pebble.errors import PayloadError
-from pebble.extensions.operator.client.connection import Target, connected, put_names, wait_for
+from pebble.extensions.operator.client.connection import Target, connected, put_account_into_topics, wait_for
 from pebble.extensions.operator.client.names import Names
 from pebble.extensions.operator.client.robot_topics import section_of
 from pebble.extensions.operator.client.robot_view import RobotView
@@ -51,7 +51,7 @@ class Observer:
         self._of: defaultdict[c.Channel | None, deque[Record]] = defaultdict(lambda: deque(maxlen=_MOST))
         self._slowest_s = ANSWER_S / 4  # of its answers
         self._arrived: deque[tuple[Message, float, float]] = deque(maxlen=_MOST)  # with the times, monotonic and epoch
-        put_names(transport, names, lambda base: base == self.base and self.view.named)
+        put_account_into_topics(transport, names, lambda base: base == self.base and self.view.named)
         for filter_ in filters or (f"{self.base}/{c.OUTGOING}/#",):
             transport.subscribe(filter_, self._take, qos=QoS.DELIVERED, direct=True)
 

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from pebble.extensions.fleet.roles import Account
-from pebble.extensions.operator.client.connection import put_names
+from pebble.extensions.operator.client.connection import put_account_into_topics
 from pebble.extensions.operator.client.names import Names
 from pebble.extensions.page.server import expand
 from pebble.extensions.thin.expander import Expander
@@ -96,7 +96,7 @@ def test_at_a_fleets_broker_it_has_an_account_of_its_own(
 
         robot, vera, exp = map(client, ("goob", "vera", "exp"))
         expander = Expander(exp)
-        put_names(exp, Names("", None, "exp"), expander.is_named)
+        put_account_into_topics(exp, Names("", None, "exp"), expander.is_named)
         robot.subscribe(f"{BASE}/incoming/#", lambda message: said.append(message.payload), qos=QoS.DELIVERED)
         vera.subscribe(f"{BASE}/outgoing/#", lambda message: seen.update({message.topic: message.payload}))
         wire = b'{"group_hz": 2, "short": "~/goob", "named": %s}' % str(level == "named").lower().encode()

@@ -122,8 +122,11 @@ def _account(settings: Any) -> str | None:
     return settings.username or "" if isinstance(settings, MqttSettings) else None
 
 
-def put_names(transport: Transport, names: Names, is_named: Callable[[str], bool]) -> None:
-    """Let the transport put this client's account into command topics, for robots that require it."""
+def put_account_into_topics(transport: Transport, names: Names, is_named: Callable[[str], bool]) -> None:
+    """Let the transport put this client's account into the topics of commands, if ``is_named(base)``.
+
+    Some robots read commands only at such topics.
+    """
     if names.account is not None:
         transport.policy.forms = NamedTopics(names.account, is_named).forms
 

@@ -24,7 +24,7 @@ from pebble.extensions.operator.client.connection import (
     connected,
     in_small_segments,
     listening,
-    put_names,
+    put_account_into_topics,
     resolve,
     target_of,
     wait_for,
@@ -132,7 +132,9 @@ def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
     with interrupted_by_signals(), connected(target) as (transport, names):
         robots = None if every else [names.base]
         sender = StopSender(new_name(), by=me(names.account), why=why, now=time.monotonic(), robots=robots, hold=hold)
-        put_names(transport, names, lambda base: base in sender.robots and sender.robots[base].estop.named)
+        put_account_into_topics(
+            transport, names, lambda base: base in sender.robots and sender.robots[base].estop.named
+        )
         outbox = _Outbox(transport, sender)
         outbox.publish()
         report = _Report(sender, outbox)
@@ -316,7 +318,7 @@ def _reset(target: Target) -> int:
     with connected(target) as (transport, names), listening(target, transport) as second:
         view, name = RobotView(names.base), shown(id_of(names.base))
         robot = view.estop
-        put_names(transport, names, lambda base: base == robot.base and robot.named)
+        put_account_into_topics(transport, names, lambda base: base == robot.base and robot.named)
         robot.subscribe(second)
         second.subscribe(LINK.topic(robot.base), lambda message: view.receive(LINK, message, 0.0, 0.0), direct=True)
         wait_for(lambda: robot.has_capabilities, _ANSWER_S)

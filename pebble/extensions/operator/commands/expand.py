@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from pebble.extensions.operator.client.connection import Target, connected, put_names
+from pebble.extensions.operator.client.connection import Target, connected, put_account_into_topics
 from pebble.extensions.operator.commands.options import CaCert, PasswordFile
 from pebble.extensions.operator.signals import interrupted_by_signals
 
@@ -28,7 +28,7 @@ def expand(
     target = Target(url=url, password_file=password_file, ca_cert=ca_cert, program="expand")
     with interrupted_by_signals(), connected(target) as (transport, names):
         expander = Expander(transport)
-        put_names(transport, names, expander.is_named)
+        put_account_into_topics(transport, names, expander.is_named)
         expander.start()
         while True:
             expander.announce()

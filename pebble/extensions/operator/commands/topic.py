@@ -16,7 +16,13 @@ from pebble.contract import DRIVE
 from pebble.contract.identity import parse_topic
 from pebble.errors import PebbleError, TransportError
 from pebble.extensions.media.rate_meter import RateMeter
-from pebble.extensions.operator.client.connection import Listener, Target, connected, put_names, subscribed_stop
+from pebble.extensions.operator.client.connection import (
+    Listener,
+    Target,
+    connected,
+    put_account_into_topics,
+    subscribed_stop,
+)
 from pebble.extensions.operator.client.estop_states import RobotEstop
 from pebble.extensions.operator.client.named_topics import moves
 from pebble.extensions.operator.client.names import Names, id_of
@@ -164,13 +170,14 @@ def pub(
         robot_of_message = cache(lambda: _estop(transport, names, message.topic))  # read once, and only if needed
 
         def is_named(_base: str) -> bool:
+            """True if the robot takes only commands whose topics have the account of the sender."""
             robot = robot_of_message()
             return robot is not None and robot.named
 
         moves_robot = names.channel(message.topic) is DRIVE and moves(message.payload)
         stoppable = robot_of_message() if moves_robot and not force else None
         if not force:
-            put_names(transport, names, is_named)
+            put_account_into_topics(transport, names, is_named)
         repetitions = 1 if rate is None else count or sys.maxsize
         for number in range(repetitions):
             if number:

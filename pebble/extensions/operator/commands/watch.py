@@ -11,7 +11,7 @@ import typer
 
 from pebble.config import load
 from pebble.errors import PebbleError
-from pebble.extensions.operator.client.connection import Target, connected, put_names
+from pebble.extensions.operator.client.connection import Target, connected, put_account_into_topics
 from pebble.extensions.operator.commands.options import BrokerUrl, CaCert, PasswordFile
 from pebble.extensions.operator.signals import interrupted_by_signals
 from pebble.runtime.as_owner import as_owner
@@ -70,7 +70,7 @@ def _received(target: Target, encoding: str | None) -> Picture:
     from pebble.extensions.operator.client.media_receiver import MediaReceiver
 
     with connected(target) as (transport, names), closing(MediaReceiver(transport, names.base)) as receiver:
-        put_names(transport, names, lambda base: base == names.base and receiver.robot.named)
+        put_account_into_topics(transport, names, lambda base: base == names.base and receiver.robot.named)
         receiver.wait_for_capabilities(_CAPABILITIES_TIMEOUT_S)
         receiver.request("video", encoding)
         end = time.monotonic() + _FIRST_PICTURE_S

@@ -10,7 +10,7 @@ import typer
 from pebble.errors import PebbleError
 from pebble.extensions.operator.client.assumed import RISK
 from pebble.extensions.operator.client.broker import problem_of
-from pebble.extensions.operator.client.connection import Target, connected, put_names, target_of
+from pebble.extensions.operator.client.connection import Target, connected, put_account_into_topics, target_of
 from pebble.extensions.operator.client.terminal.key_decoder import END
 from pebble.extensions.operator.client.terminal.keys import Terminal, has_terminal, opened
 from pebble.extensions.operator.commands.estop import me
@@ -55,7 +55,7 @@ def drive(
             names.base, by=by, device=device, speed=speed, turn=turn, heartbeat=heartbeat, assume=assume
         )
         # A robot that takes only commands with the sender's account in the topic says so, after it was subscribed to.
-        put_names(transport, names, lambda base: base == names.base and driver.robot.named)
+        put_account_into_topics(transport, names, lambda base: base == names.base and driver.robot.named)
         typer.echo(_KEYS)
         with opened() as terminal:
             _drive(transport, driver, terminal)

@@ -19,7 +19,10 @@ class RetainedValues:
         self._values = BoundedTable[Item](_TOPICS, _BYTES, lambda item: len(item.payload))
 
     def note(self, item: Item) -> None:
-        """Note a message if it was published to be retained; if that is unknown, if its topic has a value already."""
+        """Note a message that was published to be retained.
+
+        Where the transport does not tell that, note each message on a topic that has a retained value already.
+        """
         key = f"{item.source} {item.topic}"
         stored = self._values.get(key)
         if item.retained and stored is not None and not stored.retained:

@@ -177,7 +177,7 @@ class _Rows:
         self._batch.append((channel, message.log_ns, stamp, len(payload), medium, shown, online))
 
     def _declare(self, channel: Channel) -> Callable[[bytes], Activity]:
-        """Add a channel to the table of channels; return the function for its payloads' activity."""
+        """Add a channel to the table of channels; return the function that finds the activity in a payload."""
         topic = parse_topic(channel.topic)
         robot, direction, metric = "", "", channel.topic
         if topic is not None:

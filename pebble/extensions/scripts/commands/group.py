@@ -12,7 +12,7 @@ from pebble.config.visible import shown
 from pebble.contract.payloads import AutonomyStatus
 from pebble.errors import PebbleError, TransportError
 from pebble.extensions.operator.client import forms
-from pebble.extensions.operator.client.connection import Target, connected, put_names, target_of, wait_for
+from pebble.extensions.operator.client.connection import Target, connected, put_account_into_topics, target_of, wait_for
 from pebble.extensions.operator.client.names import id_of
 from pebble.extensions.operator.client.scripts import RobotScripts, options_of
 from pebble.extensions.operator.commands.options import RobotArgument
@@ -131,7 +131,7 @@ def _scripts(robot: str, target: Target) -> Iterator[tuple[Transport, RobotScrip
     with connected(target_of(robot, target)) as (transport, names):
         scripts = RobotScripts(names)
         # Commands carry this client's account if the robot, as it says itself, requires names.
-        put_names(transport, names, lambda base: base == names.base and scripts.robot.named)
+        put_account_into_topics(transport, names, lambda base: base == names.base and scripts.robot.named)
         scripts.subscribe(transport)
         wait_for(lambda: scripts.files is not None and scripts.status is not None, 1.0)
         yield transport, scripts, shown(id_of(names.base))
