@@ -13,7 +13,7 @@ def load(path: str = "/private_config.json") -> dict:
     except OSError:
         return {}
     except (ValueError, TypeError):  # of UTF-16, too
-        return {"": 0}  # no file has this key
+        return {"": 0}  # tells get() that the file cannot be read: no file has this key
 
 
 def get(settings: dict, section: str, name: str, default=None):

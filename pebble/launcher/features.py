@@ -31,7 +31,7 @@ class Features:
         return self._reported - _EXPECTED
 
     def receive(self, program: str, note: Feature) -> None:
-        """Handle a note of ``program``: store it only while it differs from what is expected."""
+        """Handle a note of ``program``: remember it while it differs from :data:`_EXPECTED`."""
         report = {(program, note.name)}
         is_as_expected = note.has == (note.name in _EXPECTED)
         if is_as_expected:

@@ -193,7 +193,7 @@ class AutonomyManager(Service):
         self.changed()
 
     def _person_stops(self) -> None:
-        """End unsigned scripts, and refuse starts for as long as the arbiter holds a person's zero."""
+        """End a script that does not sign its commands; refuse starts while the arbiter still refuses scripts."""
         self._refused_until = self.clock() + _HOLD_S
         self._end_unsigned()
 

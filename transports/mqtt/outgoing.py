@@ -292,7 +292,7 @@ class InFlightTable:
 
 
 def _note(table: dict[str, tuple[float, int]], topic: str, at: float, size: int) -> None:
-    """Note a message in ``table``, if there is room and no message as large is noted there."""
+    """Note a message in ``table``, which has the largest one of each topic, of TOPICS topics at most."""
     noted = table.get(topic)
     if (noted is None and len(table) < TOPICS) or (noted is not None and size > noted[1]):
         table[topic] = at, size

@@ -224,7 +224,10 @@ def _overlap(filter_: str, other: str) -> bool:
 
 
 def _of_bases(name: str, account: Account, *, at_hub: bool) -> Iterator[Rule]:
-    """Yield the rules of an account for its bases: of a robot, a neighbour or a gateway."""
+    """Yield the rules of an account for its bases: of a robot, a neighbour or a gateway.
+
+    ``at_hub``: for the hub of a LAN; else for the operators' broker.
+    """
     for base in account.bases:
         if ProgramRole.NEIGHBOUR in account.roles:
             if at_hub:
@@ -234,7 +237,7 @@ def _of_bases(name: str, account: Account, *, at_hub: bool) -> Iterator[Rule]:
                 return  # its robots are at a broker
             yield from (Rule(access, f"{base}/#") for access in ("read", "write"))
             if ProgramRole.ROBOT in account.roles and not at_hub:
-                yield Rule("write", f"{c.SHORT}{name}")
+                yield Rule("write", f"{c.SHORT}{name}")  # in place of its base, over a thin link
         else:  # a gateway: at a broker it publishes for the robot, at a hub for the robot's operators
             yield from (Rule("read", f"{base}/{direction}/#") for direction in (INCOMING, OUTGOING))
             yield Rule("write", f"{base}/{INCOMING if at_hub else OUTGOING}/#")

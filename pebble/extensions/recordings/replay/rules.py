@@ -99,7 +99,7 @@ class Rules:
         return Outgoing(Message(address.topic, shifted(payload, by_ns), address.qos), moves)
 
     def _listed(self, channel: Channel) -> _Address | None:
-        """Return the channel's address; None also if its robot was not recorded yet when the bases were checked."""
+        """Return the channel's address; None if it is not published, or if its robot is none of :attr:`robots`."""
         address = self._address(channel)
         return address if address is not None and address.base in self.robots else None
 
