@@ -1,4 +1,4 @@
-"""What a stranger at the broker may send."""
+"""Floods that a stranger at the broker may send."""
 
 from __future__ import annotations
 

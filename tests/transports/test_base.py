@@ -1,4 +1,4 @@
-"""What every kind of transport inherits and the shared suite does not reach: bounds and exact counts."""
+"""Bounds and exact counts, which every kind of transport inherits and the shared suite does not reach."""
 
 from __future__ import annotations
 

@@ -78,7 +78,7 @@ def test_every_form_of_the_command(make: Make) -> None:
 
 
 def test_files_that_are_not_there_or_not_inside(board: Soundboard) -> None:
-    """Which files are inside: test_clips.py."""
+    """The files inside are those of test_clips.py."""
     outside = write_wav(board.folder / "outside.wav", tone(0.1))
     board.with_clip("inside.wav", 0.1)
     names = ["../outside.wav", str(outside), "..\\outside.wav", "no.wav", "a" * 300 + ".wav", "zero\0.wav"]

@@ -182,7 +182,7 @@ class TwoOwners:
         return next((driver.name for driver in self.drivers.values() if driver.id == self._shown[1]), "")
 
     def driver_of(self, name: str) -> str:
-        """Who moves this owner; empty: it stands still, or only the board's own deadline stops a frozen one."""
+        """Return who moves this owner; empty: it stands still, or only the board's own deadline stops a frozen one."""
         wheels = self.owners[name].wheels
         if wheels.speeds is None or self.scheduler.now > wheels.deadline:
             return ""

@@ -23,7 +23,7 @@ def test_steps_save_headers_first_and_then_bits() -> None:
 
 
 def at_ease() -> LevelControl:
-    """One that has found out, by 5.0, that the link takes everything, but for moments."""
+    """Return a control that has learnt by 5.0 that the link takes everything, but for moments."""
     levels = LevelControl(2, 0.0)
     watch(levels, 0.0, 0.0, 5.0)
     assert levels.level == 0

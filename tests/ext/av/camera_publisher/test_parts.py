@@ -48,7 +48,7 @@ def red_corner(picture: Any) -> tuple[bool, bool]:
 
 
 def test_requests_for_a_full_picture_are_answered_once_a_second() -> None:
-    """One that the encoder made of its own accord answers them as well; what the sender needs is not rationed."""
+    """A key frame that the encoder makes by itself answers them as well; what the sender needs is not rationed."""
     keyframes, answers = KeyframeRequests(), []
     for tick in range(300):
         keyframes.request()
