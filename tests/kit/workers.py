@@ -1,7 +1,7 @@
 """A plugin that runs tests in several processes: ``--workers 8``. They are forked once all tests are collected.
 
-Tests without a mark come first, then those marked ``alone``, with fewer processes. Tests marked ``computing`` run
-beside them, when no other test needs a processor. Last come those marked ``solo``, one after the other.
+Tests without a mark come first, then those marked ``alone``, with fewer processes, then those marked ``solo``, one
+after the other. Tests marked ``computing`` begin when the first of these end, and run when no other needs a processor.
 
 A worker gets the tests of one module after another, in the order in which they were collected, so each fixture of a
 module is made once; tests that share a fixture of their package count as one module. Tests marked ``alone``, which take
@@ -67,22 +67,21 @@ class Workers:
     def pytest_runtestloop(self, session: pytest.Session) -> bool | None:
         if session.testsfailed or session.config.option.collectonly:
             return None  # pytest's own loop runs nothing then, either
-        background, *others, solo = lanes(session.items, session.config.getoption("--workers"))
+        background, *others = lanes(session.items, session.config.getoption("--workers"))
         try:
-            self._start(session, background)
             for lane in others:
                 self._start(session, lane)
-                while any(worker.lane is lane for worker in self._workers.values()):
+                while self._runs(lane):
                     self._wait(session)
-            while self._workers:
-                self._wait(session)
-            self._start(session, solo)
+                    if not lane.modules:  # its last workers leave processors free
+                        self._start(session, background)
+            self._start(session, background)
             while self._workers:
                 self._wait(session)
         finally:
             for connection in list(self._workers):
                 self._reap(connection)
-        if left := sum(len(module) for lane in (background, *others, solo) for module in lane.modules):
+        if left := sum(len(module) for lane in (background, *others) for module in lane.modules):
             raise session.Failed(f"{left} tests did not run: the processes that should have run them died")
         return True
 
@@ -98,9 +97,15 @@ class Workers:
         sys.stderr.flush()
         os._exit(self._code)
 
+    def _runs(self, lane: Lane) -> bool:
+        """True if a worker of the lane runs."""
+        return any(worker.lane is lane for worker in self._workers.values())
+
     def _start(self, session: pytest.Session, lane: Lane) -> None:
-        for _ in range(min(lane.processes, len(lane.modules))):
-            self._fork(session, lane)
+        """Fork the lane's workers, unless some run."""
+        if not self._runs(lane):
+            for _ in range(min(lane.processes, len(lane.modules))):
+                self._fork(session, lane)
 
     def _wait(self, session: pytest.Session) -> None:
         """Receive the reports of all lanes."""
