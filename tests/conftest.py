@@ -65,7 +65,6 @@ _LONG = (
         "ext/page/robots/test_controls.py",
         "robot/test_scripts.py",
         "robot/test_media.py",
-        "robot/test_driveable.py",
     ),
     *(
         "ext/operator/commands/test_estop.py",

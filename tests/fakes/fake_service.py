@@ -14,16 +14,6 @@ from pathlib import Path
 from pebble.config import config_of_process
 from pebble.runtime.parent import NOTIFY_FD, Notifier, ProgramRequest, earlier_requests
 
-WORDS = """12:00:00 [WARNING] mind the gap
-just a print
-12:00:01 [DEBUG] not for the public
-12:00:02 [ERROR] it broke
-Traceback (most recent call last):
-  File "somewhere.py", line 1, in <module>
-ValueError: seven
-12:00:03 [INFO] and goes on
-"""
-
 
 def note(event: str) -> None:
     name, _, journal = sys.argv[1:4]
@@ -77,8 +67,6 @@ def end(how: str) -> None:
         sys.exit("a last word")
     if how == "raise":
         raise RuntimeError("nobody catches this")
-    if how == "exit":
-        os._exit(7)
     if how == "done":
         atexit.register(lambda: note("atexit"))
         threading.Thread(target=lambda: (time.sleep(0.2), note("thread"))).start()
@@ -100,7 +88,7 @@ def main() -> None:
         report_environment()
     signal.signal(signal.SIGTERM, signal.SIG_IGN if behaviour == "stubborn" else stop)
     note("start")
-    if behaviour in ("crash", "word", "raise", "exit", "done"):
+    if behaviour in ("crash", "word", "raise", "done"):
         end(behaviour)
         return
     if behaviour == "parent":
@@ -114,12 +102,6 @@ def main() -> None:
         note("systemd:" + str("NOTIFY_SOCKET" in os.environ))
     if behaviour == "configured":
         note("config:" + config_of_process(Path(sys.argv[3]).with_name("rover.json")).base)
-    if behaviour == "talker":
-        sys.stderr.write(WORDS)
-        sys.stdout.write("x" * 100_000 + "\n")
-        sys.stdout.buffer.write(b"caf\xe9 and a tail without newline")
-        sys.stdout.flush()
-        sys.exit(3)
     live(Notifier(), alive=behaviour != "mute")
 
 

@@ -92,24 +92,19 @@ def test_commands_come_to_rest_and_pass_again_when_the_way_is_gone(
     assert len(again) == circulate
 
 
-@pytest.mark.parametrize("carried", ["", "incoming/#"], ids=["one topic", "all topics"])
 @pytest.mark.parametrize("after", [0, 1], ids=["at rest", "after one"])
 @pytest.mark.parametrize(
-    ("suffix", "at_most"),
-    [
-        *((f"incoming/flags/{name}", 1) for name in ("reboot", "service-restart", "git-pull")),
-        *((f"incoming/{name}", 2) for name in ("dance", "lights-flash", "soundboard-command", "autonomy-command")),
-    ],
+    ("suffix", "at_most"), [("incoming/flags/reboot", 1), ("incoming/dance", 2), ("incoming/autonomy-command", 2)]
 )
 def test_what_runs_something_runs_it_once(
-    world: World, monkeypatch: pytest.MonkeyPatch, suffix: str, at_most: int, after: int, carried: str
+    world: World, monkeypatch: pytest.MonkeyPatch, suffix: str, at_most: int, after: int
 ) -> None:
     monkeypatch.setattr(Action, "request", lambda _action: True)
     started(world)
     runs = []
     for number, payload in enumerate((b"true", b"true", b'{"a": 1}', b"true")):
         if number == after:
-            Way(world, "out", carried or suffix)
+            Way(world, "out", suffix)
         before = len(world.local.payloads(suffix))
         world.remote.publish(suffix, payload)
         world.run(3.1)
@@ -120,7 +115,7 @@ def test_what_runs_something_runs_it_once(
     assert runs[3] == 1
 
 
-@pytest.mark.parametrize("suffix", ["outgoing/status", "outgoing/weather", "outgoing/touch-sensors"])
+@pytest.mark.parametrize("suffix", ["outgoing/status", "outgoing/weather"])
 def test_what_leaves_the_robot(world: World, caplog: pytest.LogCaptureFixture, suffix: str) -> None:
     way = Way(world, "in", suffix)
     started(world)
@@ -134,7 +129,7 @@ def test_what_leaves_the_robot(world: World, caplog: pytest.LogCaptureFixture, s
     assert arrives(world, world.remote, suffix, b'{"n": 3}')
 
 
-@pytest.mark.parametrize("stop", [b'{"stop": "00000000000000a1"}', b"{}", b" "])
+@pytest.mark.parametrize("stop", [b'{"stop": "00000000000000a1"}', b"{}"])
 def test_stops_come_to_rest_and_each_repetition_arrives(world: World, stop: bytes) -> None:
     Way(world, "both", "incoming/#")
     started(world, mirroring=True)
@@ -145,10 +140,9 @@ def test_stops_come_to_rest_and_each_repetition_arrives(world: World, stop: byte
         assert [message for message in world.local.seen[before:] if message.topic.endswith(ESTOP)]
 
 
-@pytest.mark.parametrize("mirroring", [False, True])
-def test_a_second_robot_with_this_id(world: World, caplog: pytest.LogCaptureFixture, mirroring: bool) -> None:
-    started(world, mirroring=mirroring)
-    started(world, mirroring=mirroring)
+def test_a_second_robot_with_this_id(world: World, caplog: pytest.LogCaptureFixture) -> None:
+    started(world, mirroring=True)
+    started(world, mirroring=True)
     for client in (world.remote, world.local):
         for payload in (MOVE, ZERO):
             client.publish(DRIVE, payload)
@@ -170,16 +164,6 @@ def test_a_held_key_causes_one_probe_a_second(world: World) -> None:
         world.run(0.049)
     assert world.local.payloads(DRIVE) == [MOVE] * 100
     assert 4 <= sum(probe.topic == TOPIC for probe in world.local.probes[before:]) <= 6
-
-
-def test_probes_of_others_are_forwarded_once_and_prove_nothing(world: World) -> None:
-    started(world)
-    probe = b" \t" * 16
-    for _ in range(2):
-        world.remote.publish(DRIVE, probe)
-    world.run(0)
-    assert [message.payload for message in world.local.probes].count(probe) == 1
-    assert arrives(world, world.local, DRIVE, MOVE)
 
 
 def examine(cycles: Cycles, side: Side, topic: str, payload: bytes) -> Finding:

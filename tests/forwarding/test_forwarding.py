@@ -15,12 +15,12 @@ from pebble.config import parse
 from pebble.contract import DRIVE, Kind, codec
 from pebble.contract.codec import MAX_COMMAND_BYTES
 from pebble.forwarding import loopback_filter as loopback_filter
+from pebble.forwarding import reconciliation as reconciliation_module
 from pebble.forwarding.admission import MAX_ACTIONS, MAX_UNKNOWN_COMMANDS, MAX_UNKNOWN_FLAGS, Admission
 from pebble.forwarding.event_buffer import RESEND_S, EventBuffer
 from pebble.forwarding.forwarder import Forwarder
 from pebble.forwarding.loopback_filter import EXPIRY_S, LoopbackFilter
-from pebble.forwarding.probes import Probes, new_probe
-from pebble.forwarding.reconciliation import TOPICS, Reconciliation, Resolution
+from pebble.forwarding.reconciliation import Reconciliation, Resolution
 from pebble.forwarding.routing import MIRROR, TABLE_A1, Drop, Forward, Rules, Side
 from pebble.forwarding.subjects import Subjects
 from pebble.transports import Message, QoS, State, clock
@@ -49,8 +49,7 @@ class TestLoopbackFilter:
         ("history", "own"),
         [
             ("t+1 t+0 t+1 t?1 t?2 t?0 t?1 t?1", "yes no yes yes no"),  # not those of others
-            ("t+1 u?1", "no"),  # topics do not mix
-            ("t+1 t+0 t?0 t?1", "yes no"),  # lost ones are passed over
+            ("t+1 t+0 u?1 t?0 t?1", "no yes no"),  # topics do not mix, and lost ones are passed over
             ("t+1 late t?1", "no"),
             ("t+1 unsent t?1", "no"),  # what was not sent does not come back
         ],
@@ -124,13 +123,9 @@ class TestAdmission:
         ("topic", "kind"),
         [
             ("incoming/unknown", Kind.COMMAND),
-            ("incoming/mcu/1/light", Kind.COMMAND),
             ("incoming/flags/mine", Kind.FLAG),
             ("incoming/flags/mqtt-video", None),
-            ("incoming/flags/reboot", None),
-            ("incoming/drive-values", None),
             ("incoming/estop", None),
-            ("incoming", None),
             ("outgoing/unknown", None),
         ],
     )
@@ -143,8 +138,7 @@ class TestAdmission:
     @pytest.mark.parametrize(
         ("side", "topic", "refused"),
         [
-            *((REMOTE, f"incoming/{metric}", Drop.TOO_LARGE) for metric in ("drive-values", "flags/reboot", "mine")),
-            *((REMOTE, f"incoming/flags/{flag}", Drop.TOO_LARGE) for flag in ("mqtt-video", "mine")),
+            *((REMOTE, f"incoming/{metric}", Drop.TOO_LARGE) for metric in ("drive-values", "flags/mqtt-video")),
             (REMOTE, "incoming/estop", None),  # any payload is one
             (LOCAL, "outgoing/map", None),
         ],
@@ -184,29 +178,20 @@ class TestReconciliation:
             ("L:a R:b", ["hold", "pass"]),
             ("l:a R:a", ["pass", "known"]),
             ("l:a R:b", ["pass", "pass"]),
-            ("l:a l:a", ["pass", "pass"]),
-            ("r:a l:b r:a", ["pass", "pass", "pass"]),
             ("sync L:a", ["pass"]),
-            ("r:a l:b L:c", ["pass", "pass", "pass"]),
             ("R:a x:b R:a", ["pass", "pass", "overtaken"]),
             ("R:a x:b sync R:a", ["pass", "pass", "pass"]),
             ("R:a x:b r:c R:d", ["pass", "pass", "pass", "pass"]),
-            ("r:a r:b R:a", ["pass", "pass", "pass"]),
             ("r:a r:b B:a", ["pass", "pass", "correct"]),
             ("l:a l:b A:a", ["pass", "pass", "correct"]),
-            ("r:a l:b A:a", ["pass", "pass", "correct"]),
             ("l:a l:b A:c", ["pass", "pass", "pass"]),
-            ("l:a l:b A:b", ["pass", "pass", "known"]),
             ("l:a l:b L:a", ["pass", "pass", "pass"]),
             ("L:a sync R:b", ["hold", "restore"]),
             ("L:a sync l:c R:b", ["hold", "pass", "overtaken"]),
             ("L:a sync l:c r:d R:b", ["hold", "pass", "pass", "pass"]),
             ("sync l:a R:b again R:c", ["pass", "overtaken", "pass"]),
-            ("L:a sync again R:b", ["hold", "pass"]),
             ("L:a sync r:b R:c", ["hold", "pass", "pass"]),
-            ("r:a l:b B:a", ["pass", "pass", "correct"]),
             ("r:a r:b B:c", ["pass", "pass", "pass"]),
-            ("r:a r:b B:b", ["pass", "pass", "known"]),
             ("r:a r:b r:a B:b", ["pass", "pass", "pass", "correct"]),
             ("r:a " + "r:b " * 9 + "B:a", [*["pass"] * 10, "correct"]),
         ],
@@ -259,8 +244,11 @@ class TestReconciliation:
                 reconciliation.receive(place, "t", payload.encode(), retained=who.isupper())
         assert reconciliation.synchronize(side) == [(side, "t", payload.encode()) for payload in sent]
 
-    @pytest.mark.parametrize(("size", "number"), [(1, 2 * TOPICS), (1 << 19, 40)])
-    def test_its_memory_is_bounded_in_topics_and_in_bytes(self, size: int, number: int) -> None:
+    @pytest.mark.parametrize(("size", "number"), [(1, 1024), (1 << 19, 40)])
+    def test_its_memory_is_bounded_in_topics_and_in_bytes(
+        self, monkeypatch: pytest.MonkeyPatch, size: int, number: int
+    ) -> None:
+        monkeypatch.setattr(reconciliation_module, "TOPICS", 512)
         reconciliation = Reconciliation(REMOTE)
 
         def fill(number: int) -> None:
@@ -271,23 +259,7 @@ class TestReconciliation:
 
         assert grows_no_more(fill, number)
         assert (reconciliation.value("said/0"), reconciliation.value(f"said/{2 * number - 1}")) == (None, bytes(size))
-        assert len(reconciliation.synchronize(REMOTE)) <= min(number, 2 * TOPICS)
-
-
-class TestProbes:
-    def test_one_that_is_announced_and_received_is_the_bridges_in_either_order(self) -> None:
-        probes = Probes()
-        first, second = new_probe(1), new_probe(1)
-        assert first != second
-        assert [probes.announce(first), probes.see(first)] == [False, True]
-        assert [probes.see(second), probes.announce(second)] == [False, True]
-
-        def fill(number: int) -> None:
-            probes.see(b"%d" % number)
-            probes.see(b"x" * (100_000 + number))
-            probes.announce(b"%d" % -number)
-
-        assert grows_no_more(fill, 1000)
+        assert len(reconciliation.synchronize(REMOTE)) <= min(number, 2 * 512)
 
 
 class Wire(MemoryTransport):
@@ -368,13 +340,6 @@ class TestEventBuffer:
         events.flush()
         assert remote.sent == [b"1", b"2", b"2", b"3", b"4"]
 
-    def test_one_refused_in_between_is_sent_with_the_next(self, events: EventBuffer, remote: Wire) -> None:
-        remote.up = False
-        self.publish(events, 1)
-        remote.up = True
-        self.publish(events, 2)
-        assert remote.sent == [b"1", b"2"]
-
 
 class TestGate:
     """An event that arrives while the gate opens or shuts: what was waiting may have been sent, or cleared, already."""
@@ -409,21 +374,16 @@ class TestLate:
         [
             ("drive-values", b'{"z": 1}', 0.5),
             ("drive-values", b"{", 0.5),
-            ("drive-values", b'{"z": 0}', inf),  # a stop must arrive
-            ("drive-values", b'\xef\xbb\xbf{"z": "0", "x": "no"}\0', inf),
-            ("drive-values", b'{"z": "0.1"}\0', 0.5),
+            ("drive-values", b'\xef\xbb\xbf{"z": "0", "x": "no"}\0', inf),  # a stop must arrive
             ("estop", b"{}", inf),
             ("estop-reset", b'{"boot": "a", "count": 1}', 0.5),
             ("unknown", b"1", 0.5),
-            ("lights-solid", b'{"r": 1}', 2.0),
             ("soundboard-command", b'{"action": "play", "file": "a"}', 2.0),
             ("soundboard-command", b'{"enabled": false}', inf),
-            ("autonomy-command", b'{"action": "start", "file": "a"}', 0.5),
             ("autonomy-command", b'{"action": "start", "enabled": false, "file": "a"}', 0.5),
             ("autonomy-command", b'{"action": "Stop", "file": "a"}', inf),
             ("outlets/lamp/power", b'{"on": true}', 0.5),
             ("outlets/lamp/power", b'{"on": false}\r\n\0', inf),
-            ("front-camera", b'{"enabled": true}', 2.0),
             ("front-camera", b"false\0", inf),
             ("flags/reboot", b"true", 0.5),
             ("flags/mqtt-video", b"true", inf),
@@ -446,30 +406,21 @@ class TestSignatures:
 
     PERSONS = (
         *(b'{"z":0.5}', b'{"z":0.5,"source":"autonomy-page","run":7}', b"{", b'{"z":0.5,"source":"p\\u0061ge"}'),
-        *(b'{"z":0.5,"run":1073741823}', b'{"z":0.5,"source":"autonomy ","run":1}', b'{"z":0.5,"source":"Autonomy"}'),
         b'{"z":0.5,"value":{"z":0.1,"source":"page"},"source":"autonomy"}',
-        b'{"z":0.5,"source":"autonomy","source":"page","run":1}',
     )
     MOVING = (
-        *(
-            b'{"z":0.5,"source":"autonomy","run":1}',
-            b'{"z":0.5,"source":"autonomy","run":1',
-            b'{"z":0.5,"source":"autonomy"}',
-        ),
-        *(b'{"y":1e-9,"source":"autonomy","run":"7"}', b'{"z":0.5,"source":"\\u0061utonomy","run":1}'),
-        *(b'{"z":0.5,"\\u0073ource":"autonomy","run":1}', b'{"z":0.5,"source":"page","source":"autonomy","run":1}'),
-        b'{"value":{"z":0},"value":{"z":0.5,"source":"\\u0061utonomy","run":1},"source":"page"}',
-        b'{"v\\u0061lue":{"z":0.5,"source":"autonomy","run":1}}',
+        *(b'{"z":0.5,"source":"autonomy","run":1', b'{"y":1e-9,"source":"autonomy","run":"7"}'),
+        *(b'{"z":0.5,"\\u0073ource":"\\u0061utonomy","run":1}', b'{"v\\u0061lue":{"z":0.5,"source":"autonomy"}}'),
         *(b'{"z":0.5,"sour\\ce":"autonom\\y","run":1}', b'{"z":0.5,"source":"autonomy","run":1}\0'),  # boards read it
-        b'\xef\xbb\xbf{"z":0.5,"source":"autonomy","run":1}',
+        b'\xef\xbb\xbf{"z":0.5,"source":"page","source":"autonomy","run":1}',
     )
-    ZEROS = (b"1", b"-1", b'"7"', b'1,"valid_ms":0', b'1,"x":"0"', b'1,"value":{"source":"autonomy"}')
+    ZEROS = (b'"7"', b'1,"valid_ms":0', b'1,"value":{"source":"autonomy"}')
 
-    @pytest.fixture(params=[{}, {"drive_values": "else/where"}], ids=["usual", "renamed"])
-    def subjects(self, request: pytest.FixtureRequest) -> Subjects:
+    @pytest.fixture
+    def subjects(self) -> Subjects:
         line = {"enabled": True, "serial": {"port": "/dev/ttyACM0"}}
         other = {**line, "serial": {"port": "/dev/ttyACM1"}, "topics": {"drive_values": "another/{base}"}}
-        services = {"serial_mcu_bridge": {**line, "topics": request.param, "instances": {"arm": other}}}
+        services = {"serial_mcu_bridge": {**line, "instances": {"arm": other}}}
         return Subjects(parse({"robot": {"id": "rover"}, "services": services}, folder=Path.cwd(), env={}))
 
     @staticmethod

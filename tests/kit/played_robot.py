@@ -80,9 +80,6 @@ class RecordingRobot:
         topic = f"{self.base}/incoming/drive-values"
         return [payload for at, name, payload in list(self.received) if name == topic and at >= since]
 
-    def topics(self) -> set[str]:
-        return {topic for _, topic, _ in list(self.received)}
-
     def times(self, metric: str) -> list[float]:
         """Return the times at which commands of a metric have arrived."""
         return [at for at, topic, _ in list(self.received) if topic == f"{self.base}/incoming/{metric}"]
@@ -141,10 +138,6 @@ class RecordingRobot:
         """Publish a command to the robot, as another client does."""
         payload = msgspec.json.encode(body)
         self._transport.publish(f"{self.base}/incoming/{metric}", payload, qos=QoS.DELIVERED)
-
-    def stranger(self, **drive: float) -> None:
-        """Publish a drive command without control, as the original's page does."""
-        self.command("drive-values", drive)
 
     def stop(self, name: str = "0123456789abcdef", by: str = "ann@desk", why: str = "dog") -> None:
         """Stop the robot as another client does."""

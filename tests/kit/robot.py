@@ -11,8 +11,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -109,7 +108,7 @@ class LocalNetwork:
         if kind == "memory":
             self._memory = MemoryHub()
         elif kind == "mqtt":
-            broker = self._broker = Broker(folder)
+            broker = Broker(folder)
             self._ends.callback(broker.stop)
             self.local_mqtt = {"host": "127.0.0.1", "port": broker.port}
             self._mqtt = MqttSettings(host="127.0.0.1", port=broker.port)
@@ -140,13 +139,6 @@ class LocalNetwork:
         if self.kind == "mqtt":
             return create("mqtt", name, self._mqtt)
         return create("zenoh", name, ZenohSettings(run_dir=self._run_dir, client=True))
-
-    @contextmanager
-    def outage(self) -> Iterator[None]:
-        """Stop the broker during the block. MQTT only: peers on Zenoh exchange messages without a hub."""
-        self._broker.kill()
-        yield
-        self._broker.start()
 
     def close(self) -> None:
         self._ends.close()

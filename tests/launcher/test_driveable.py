@@ -18,9 +18,7 @@ WELL = {
 #: What is different, and what follows.
 CASES = {
     "all is well": ({}, "yes"),
-    "heard some seconds ago": ({"board": (OWNER, Mcu("ready", 1000))}, "yes"),
     "port": ({"board": (OWNER, Mcu("absent", None, "no /dev/ttyACM0"))}, "no serial: no /dev/ttyACM0"),
-    "port, without a reason": ({"board": (OWNER, Mcu("absent", None))}, "no serial: there is no such device"),
     "stopped sending": (
         {"board": (OWNER, Mcu("silent", 10000))},
         "no serial: its board has stopped sending: it hangs, or has lost its power",
@@ -80,8 +78,7 @@ def test_the_worst_that_is_known_decides(different: dict[str, tuple[str, Note] |
     assert robot.shows() == expected
 
 
-@pytest.mark.parametrize("state", ["init", "restarting", "failed", "stopped"])
-@pytest.mark.parametrize("program", [OWNER, BRIDGE])
+@pytest.mark.parametrize(("program", "state"), [(OWNER, "init"), (BRIDGE, "restarting"), (OWNER, "stopped")])
 def test_a_process_that_is_not_ready_drives_nothing(program: str, state: str) -> None:
     robot = Assessed()
     for note in WELL.values():

@@ -41,7 +41,6 @@ def forwarded(monkeypatch: pytest.MonkeyPatch) -> Iterator[Forwarded]:
 @pytest.mark.parametrize(
     ("line", "published", "message"),
     [
-        ("[ERROR] far away", True, "[x] far away"),
         ("[ERROR] " + "y" * 2044, True, "[x] " + "y" * 2044),
         ("[ERROR] " + "y" * 2045, True, "[x] " + "y" * 2041 + "..."),
         ("[INFO] routine", True, None),  # below the least level
@@ -88,22 +87,17 @@ def test_a_tagged_line_is_logged_under_the_name_in_its_tag(forwarded: Forwarded)
 def test_the_launchers_own_records_go_the_same_way(forwarded: Forwarded) -> None:
     log = logging.getLogger("pebble.launcher.process_supervisor")
     with OwnRecords(forwarded.forwarder, "INFO"):
-        log.warning("child %s ended", "x")
         log.info("quiet")
         log.debug("not even written")
         log.log(35, "between the levels")
         log.warning("it broke", exc_info=ValueError("seven"))
     log.warning("after the end")
-    assert [record.message.partition("\n")[0] for record in forwarded.records] == [
-        *("[launcher] child x ended", "[launcher] between the levels", "[launcher] it broke")
-    ]
-    record = forwarded.records[0]
-    assert (record.level, record.pid, record.logger) == ("WARNING", os.getpid(), log.name)
-    written = forwarded.written()
-    assert "[INFO] [launcher] quiet" in written
-    assert "[WARNING] [launcher] ValueError: seven" in written
-    assert "not even" not in written
-    assert "after the end" not in written
+    found = [(one.level, one.pid, one.logger, one.message.partition("\n")[0]) for one in forwarded.records]
+    expected = [("WARNING", text) for text in ("[launcher] between the levels", "[launcher] it broke")]
+    assert found == [(level, os.getpid(), log.name, text) for level, text in expected]
+    written = [line.partition(" ")[2] for line in forwarded.written().splitlines()]
+    assert written[:2] == ["[INFO] [launcher] quiet", "[WARNING] [launcher] between the levels"]
+    assert written[-1] == "[WARNING] [launcher] ValueError: seven"
 
 
 def test_writing_never_waits_for_a_reader() -> None:
@@ -127,8 +121,6 @@ def test_writing_never_waits_for_a_reader() -> None:
 @pytest.mark.parametrize(
     ("line", "text"),
     [
-        (b"two\r", "two"),
-        (b"", ""),
         (b"  three  ", "  three"),
         (b"\x1b[2Jgone\x07 \xe2\x80\xae.\r\n", "\\u001b[2Jgone\\u0007 \\u202e."),  # it does not steer a terminal
         (b"a\xff\xfeb", "a\ufffd\ufffdb"),
@@ -141,15 +133,11 @@ def test_a_line_becomes_text(line: bytes, text: str) -> None:
 @pytest.mark.parametrize(
     ("line", "level", "text"),
     [
-        ("12:00:00 [INFO] hello", "INFO", "hello"),
-        ("12:00:00 [WARNING] hello", "WARNING", "hello"),
         ("12:00:00 [WARN] hello", "WARNING", "hello"),
-        ("12:00:00,123 [ERROR] hello", "ERROR", "hello"),
-        ("12:00:00 [CRITICAL] [x] y", "CRITICAL", "[x] y"),
+        ("12:00:00,123 [FATAL] [x] y", "CRITICAL", "[x] y"),
         ("12:00:00 [DEBUG] ", "DEBUG", ""),
         ("12:00:00 [SHOUT] hello", "INFO", "12:00:00 [SHOUT] hello"),
         ("12:00 [ERROR] hello", "INFO", "12:00 [ERROR] hello"),
-        ("ERROR hello", "INFO", "ERROR hello"),
     ],
 )
 def test_a_line_of_the_log_format_names_its_level(line: str, level: str, text: str) -> None:
@@ -160,13 +148,7 @@ def test_a_line_of_the_log_format_names_its_level(line: str, level: str, text: s
 LINES = {
     "a traceback has the level of the line it belongs to": (
         ("12:00:00 [WARNING] it broke", "W"),
-        ("Traceback (most recent call last):", "W"),
-        ('  File "x.py", line 1', "W"),
-        ("ValueError: no", "W"),
-        ("During handling of the above exception, another exception occurred:", "W"),
-        ("Traceback (most recent call last):", "W"),
-        ("KeyError: 1", "W"),
-        ("12:00:01 [INFO] goes on", "I"),
+        *(("Traceback (most recent call last):", "W"), ("ValueError: no", "W"), ("12:00:01 [INFO] goes on", "I")),
         ("a print", "I"),
     ),
     "one of its own is an error": (

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tests.motion.traces import repeat, traces
 
-HISTORIES = 300
+HISTORIES = 100
 
 
 def test_micropython_returns_the_same_results(tmp_path: Path) -> None:

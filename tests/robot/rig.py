@@ -112,10 +112,9 @@ class Rig:
     """Brokers, MCU, robot and operator. ``kind`` is ``mqtt``, ``zenoh`` or ``single`` (one broker for both sides).
 
     The robot reaches the remote broker through ``uplink``, a proxy that can fail. With ``direct`` it connects without
-    the proxy, because a proxy acknowledges TCP segments itself and so changes the timing. ``remote`` replaces
-    its own broker. ``listens``: what the operator subscribes to, below the robot's
-    base; ``operator`` replaces it. ``scripts``: which of ours it has. ``top``: more sections of the config; others are
-    services'.
+    the proxy, because a proxy acknowledges TCP segments itself and so changes the timing. ``remote`` replaces its own
+    broker, ``operator`` its operator. ``scripts``: which of ours it has. ``top``: more sections of the config; others
+    are services'.
     """
 
     def __init__(
@@ -128,7 +127,6 @@ class Rig:
         start: bool = True,
         direct: bool = False,
         remote: Broker | None = None,
-        listens: str = "#",
         operator: Operator | None = None,
         scripts: tuple[str, ...] = (),
         top: dict[str, Any] | None = None,
@@ -155,7 +153,7 @@ class Rig:
         self.config.write_text(json.dumps(self._config(), indent=1))
         self.log = self.folder / "robot.log"
         self._robot: subprocess.Popen[bytes] | None = None
-        self.operator = operator or Operator(self.remote.port, f"pebble/robots/{name}", listens)
+        self.operator = operator or Operator(self.remote.port, f"pebble/robots/{name}")
         if start:
             try:
                 self.start()
@@ -200,9 +198,7 @@ class Rig:
 
     def wait_until_up(self, since: float, timeout: float = 60.0) -> None:
         """Every service is ready, and heartbeats arrive."""
-        assert until(lambda: self._up(since), timeout), (
-            f"the robot is not up: {self._newest()}\n{self.log.read_text()[-4000:]}"
-        )
+        assert until(lambda: self._up(since), timeout), f"the robot is not up:\n{self.log.read_text()[-4000:]}"
 
     def stop(self, *signals: signal.Signals) -> int:
         """Stop the robot with SIGTERM, or with these; returns the launcher's exit code."""
@@ -242,6 +238,15 @@ class Rig:
         os.kill(pid, signal.SIGKILL)
         return time.monotonic()
 
+    def shows_driveable(self, state: str, why: str = "", seconds: float = 20.0) -> bool:
+        """Wait until the status says so; return whether it does."""
+
+        def found() -> bool:
+            driveable = self.operator.newest("status").get("value", {}).get("driveable", {})
+            return driveable.get("state") == state and why in driveable.get("why", "")
+
+        return until(found, seconds)
+
     # -- its scripts
 
     def run_script(self, file: str, config: dict[str, Any] | None = None) -> float:
@@ -269,13 +274,6 @@ class Rig:
 
     # -- faults
 
-    def kill_local_broker(self) -> None:
-        """Kill the robot's own broker; it starts again after a second, without its retained messages."""
-        assert self.local is not None
-        self.local.kill()
-        time.sleep(1)
-        self.local.start()
-
     @staticmethod
     def alive(pid: int) -> bool:
         """Does this process still run? (A zombie does not.)"""
@@ -297,16 +295,6 @@ class Rig:
             return False
         states = [service["state"] for service in status.json["value"]["services"].values()]
         return bool(states) and set(states) == {"ready"} and heartbeat.json.get("online") is not False
-
-    def _newest(self) -> str:
-        """What the operator received last, and how long ago."""
-        now, parts = time.monotonic(), []
-        for suffix in ("outgoing/status", "outgoing/online", ""):
-            one = self.operator.last(suffix)
-            parts.append(
-                f"no {suffix}" if one is None else f"{now - one.at:.1f} s ago {one.topic} {one.payload[:300]!r}"
-            )
-        return "; ".join(parts)
 
     # -- its config
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from tests.commands.command_line import program
 from tests.robot.faults import FAULTS, Drive, silent
 from tests.robot.operator import Operator, retained_messages
 from tests.robot.rig import BASE, Rig
@@ -61,6 +62,24 @@ def changed_state(rig: Rig) -> None:
 def test_a_fault_while_an_operator_drives(driven: Rig, name: str) -> None:
     drive = Drive(driven, turns_s=FAULTS[name].turns_s)
     FAULTS[name].perform(driven, drive, lambda: changed_state(driven))
+
+
+@pytest.mark.parametrize("driven", ["zenoh"], indirect=True)
+def test_an_unplugged_board_is_named_everywhere_until_it_is_back(driven: Rig) -> None:
+    changed_state(driven)
+    assert driven.shows_driveable("yes")
+    driven.mcu.command("unplug")
+    why = f"serial: cannot open {driven.mcu.port}"
+    assert driven.shows_driveable("no", why)
+    assert f"CANNOT BE DRIVEN OR STOPPED: {why}" in pebble("estop", driven.config, "--remote")
+    driven.mcu.command("replug")
+    assert driven.shows_driveable("yes")
+    pebble("estop", "reset", driven.config, "--remote")
+    assert until(lambda: not driven.operator.newest("estop/serial")["latched"])
+
+
+def pebble(*words: object) -> str:
+    return "".join(program(*map(str, words)).communicate(timeout=60))
 
 
 def test_an_operator_dies_while_the_link_is_silent(driven: Rig) -> None:

@@ -15,7 +15,7 @@ pytestmark = [pytest.mark.computing, pytest.mark.usefixtures("quiet")]
 
 @pytest.mark.parametrize(
     ("kind", "seed", "number"),
-    [("owners", 1, cases(60, 200)), ("groups", 2, cases(40, 150))],
+    [("owners", 1, cases(60, 200)), ("groups", 2, cases(20, 150))],
 )
 def test_no_schedule_violates_a_rule(kind: str, seed: int, number: int) -> None:
     violated = [rule for result in ENGINE.run(kind, seed, range(number)) for rule in result.problems]

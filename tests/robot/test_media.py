@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import time
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 
@@ -19,6 +21,7 @@ CAMERA, AUDIO = "outgoing/front-camera", "outgoing/audio"
 VIDEO_FLAG, AUDIO_FLAG = "incoming/flags/mqtt-video", "incoming/flags/mqtt-audio"
 MEDIA = {"camera_publisher", "audio_publisher", "audio_receiver"}
 ASK_VIDEO, ASK_AUDIO = "incoming/front-camera", "incoming/audio"
+SEGMENT = re.compile(r"/dev/shm/\d+\.zenoh")
 
 
 def counters(seen: list[ReceivedMessage]) -> list[int]:
@@ -28,8 +31,13 @@ def counters(seen: list[ReceivedMessage]) -> list[int]:
     return [counter for one in pictures if (counter := read_counter(one.picture)) is not None]
 
 
+def segments_of(rig: Rig) -> set[str]:
+    mapped = [Path(f"/proc/{pid}/maps").read_text() for pid in rig.processes().values()]
+    return {path for one in mapped for path in SEGMENT.findall(one)}
+
+
 @pytest.mark.parametrize("kind", ["mqtt", "zenoh"])
-def test_stopping_media_does_not_delay_driving(kind: str) -> None:
+def test_stopping_media_does_not_delay_driving_and_leaves_no_shared_memory(kind: str) -> None:
     with Rig(kind, av_daemon=DEVICES) as rig:
         began = time.monotonic()
         for ask, flag in ((ASK_VIDEO, VIDEO_FLAG), (ASK_AUDIO, AUDIO_FLAG)):
@@ -38,6 +46,8 @@ def test_stopping_media_does_not_delay_driving(kind: str) -> None:
         assert until(lambda: len(counters(rig.operator.on(CAMERA, began))) > 3, 15, step=0.1)
         assert until(lambda: len(rig.operator.on(AUDIO, began)) > 20, 15)
         assert rig.processes().keys() >= MEDIA
+        assert until(lambda: len(segments_of(rig)) >= 2)
+        used = segments_of(rig)
         drive_from = time.monotonic()
         for number in range(40):
             rig.operator.send("incoming/drive-values", {"x": 0, "z": round(0.1 + number / 100, 3)}, qos=0)
@@ -49,3 +59,5 @@ def test_stopping_media_does_not_delay_driving(kind: str) -> None:
         assert len(moves) > 35
         assert max(later - earlier for earlier, later in pairwise(moves)) < 0.5
         assert until(lambda: not MEDIA & rig.processes().keys(), 15)
+        assert rig.stop() == 0
+    assert [path for path in used if Path(path).exists()] == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -83,6 +84,14 @@ def test_four_heartbeats_a_second(uplinked: Station) -> None:
     assert 1.5 <= heartbeats[-1].at - heartbeats[0].at <= 3.0
     assert abs(heartbeats[-1].json["t"] / 1000 - time.time()) < 3
     assert "outgoing/online" in retained_messages(uplinked.rig.remote.port, BASE)
+
+
+def test_the_launcher_forks_its_programs_so_it_has_one_thread_and_only_its_own_sockets(uplinked: Station) -> None:
+    launcher = Path(f"/proc/{uplinked.rig.launcher_pid}")
+    assert len(list((launcher / "task").iterdir())) == 1
+    opened = [path.readlink().name for path in (launcher / "fd").iterdir()]
+    sockets = [name for name in opened if name.startswith("socket:")]
+    assert len(sockets) == 3, "two for its stop signals, one to the announcer"
 
 
 def test_stopping_the_robot_stops_the_wheels_and_reports_offline(uplinked: Station) -> None:

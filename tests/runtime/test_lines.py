@@ -5,13 +5,12 @@ from __future__ import annotations
 import random
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from pebble.runtime.lines import LineSplitter
 
 
-@settings(max_examples=200)
 @given(st.lists(st.binary(max_size=20).filter(lambda line: b"\n" not in line)), st.randoms(use_true_random=False))
 def test_lines_come_out_however_the_stream_is_cut(lines: list[bytes], cuts: random.Random) -> None:
     stream = b"".join(line + b"\n" for line in lines)

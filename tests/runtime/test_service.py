@@ -177,12 +177,6 @@ def running(robot: Robot) -> Robot:
 # -- life
 
 
-def test_hardware_opens_before_the_transport_and_is_safe_before_it_closes(running: Robot) -> None:
-    running.end()
-    assert running.service.life == ["start closed", "stop connected"]
-    assert running.service.transport.state is State.CLOSED
-
-
 def test_a_message_that_a_handler_fails_on_is_counted_and_ends_nothing(caplog: pytest.LogCaptureFixture) -> None:
     class Fragile(Recorder):
         def note(self, value: Any) -> None:
@@ -198,10 +192,7 @@ def test_a_message_that_a_handler_fails_on_is_counted_and_ends_nothing(caplog: p
     robot.publish(DRIVE_TOPIC, '{"x": 0.5}')
     assert robot.saw(0.5)
     (record,) = [record for record in caplog.records if "drive-values" in record.message]
-    assert record.message == "failed on a message on drive-values (1 so far)"
-    assert record.levelno == logging.ERROR
-    assert record.exc_text is not None
-    assert "RuntimeError: handler failed" in record.exc_text
+    assert (record.message, record.levelname) == ("failed on a message on drive-values (1 so far)", "ERROR")
     robot.close()
     assert robot.error is None
 
@@ -225,20 +216,24 @@ def test_a_timer_or_a_reader_that_fails_ends_the_service_safely(timer: str) -> N
     robot.close()
 
 
-def test_a_service_that_cannot_start_is_stopped_all_the_same() -> None:
+def test_a_service_that_cannot_start_is_stopped_and_one_that_quits_before_it_runs_ends_at_once() -> None:
     class Broken(Recorder):
         def start(self) -> None:
             raise RuntimeError("no such device")
 
-    robot = Robot(Broken)
+    robot, quits = Robot(Broken), Robot()
     with pytest.raises(RuntimeError, match="no such device"):
         robot.service.run()
     assert robot.service.life == ["stop closed"]
+    quits.service.quit()
+    quits.service.run()
+    assert [entry.split()[0] for entry in quits.service.life] == ["start", "stop"]
 
 
-def test_opened_things_are_closed_after_stop_in_reverse_order_even_if_one_fails() -> None:
+def test_hardware_opens_before_the_transport_and_is_closed_before_it_in_reverse_order_even_if_one_fails() -> None:
     class Opener(Recorder):
         def start(self) -> None:
+            super().start()
             self.on_stop(lambda: self.life.append("close first"))
             self.on_stop(self.fail)
             self.on_stop(lambda: self.life.append(f"close last {self.transport.state.value}"))
@@ -249,15 +244,9 @@ def test_opened_things_are_closed_after_stop_in_reverse_order_even_if_one_fails(
     robot = Robot(Opener)
     robot.start()
     robot.end()
-    assert robot.service.life == ["stop connected", "close last connected", "close first"]
+    assert robot.service.life == ["start closed", "stop connected", "close last connected", "close first"]
     assert str(robot.error) == "will not close"
     assert robot.service.transport.state is State.CLOSED
-
-
-def test_quit_before_run_ends_at_once(robot: Robot) -> None:
-    robot.service.quit()
-    robot.service.run()
-    assert [entry.split()[0] for entry in robot.service.life] == ["start", "stop"]
 
 
 def test_waiting_jobs_are_not_executed_when_the_service_quits(running: Robot) -> None:
@@ -268,22 +257,15 @@ def test_waiting_jobs_are_not_executed_when_the_service_quits(running: Robot) ->
     assert running.service.seen == [0.5]
 
 
-def test_everything_runs_on_one_thread(running: Robot) -> None:
-    running.publish(DRIVE_TOPIC, '{"x": 0.5}')
-    assert running.saw(0.5)
-    running.on_service_thread(lambda: running.service.threads.add(threading.get_ident()))
-    assert until(lambda: running.service.ticks > 3)
-    assert len(running.service.threads) == 1
-    assert threading.get_ident() not in running.service.threads
-
-
-def test_timers_go_on_under_a_flood_and_calls_come_when_they_are_due(running: Robot) -> None:
+def test_timers_go_on_under_a_flood_and_calls_come_when_they_are_due_all_on_one_thread(running: Robot) -> None:
     called: list[float] = []
     due = time.monotonic() + 0.05
     running.on_service_thread(lambda: running.service.call_at(due, lambda: called.append(time.monotonic())))
     before = running.service.ticks
     assert until(lambda: running.publish(DRIVE_TOPIC, '{"x": 0.1}') or (called and running.service.ticks > before))
     assert called[0] >= due
+    assert len(running.service.threads) == 1
+    assert threading.get_ident() not in running.service.threads
 
 
 # -- work on the thread that brings it
@@ -320,18 +302,6 @@ def test_a_service_that_works_or_hangs_takes_no_work_of_other_threads(idle: Robo
     idle.service.go_on.set()
     assert run_when_idle(idle.service, lambda: ran.append("visitor"))
     assert ran == ["visitor"]
-
-
-def test_work_of_another_thread_goes_before_nothing_that_waits_and_runs_on_that_thread(idle: Robot) -> None:
-    order: list[str | int] = []
-
-    def first() -> None:
-        idle.service.post(lambda: order.append("posted"))
-        order.append(threading.get_ident())
-
-    assert run_when_idle(idle.service, first)
-    assert run_when_idle(idle.service, lambda: order.append("second"))
-    assert order == [threading.get_ident(), "posted", "second"]
 
 
 def test_a_timer_that_another_thread_sets_wakes_the_services_own(idle: Robot) -> None:
@@ -428,28 +398,10 @@ def test_a_malformed_message_is_counted_logged_once_and_replaces_nothing(
     assert until(lambda: running.service.counters["refused"] == 100)
     running.service.go_on.set()
     assert running.saw(0.5, 0.0)
-    lines = [record.message for record in caplog.records if "refused a message" in record.message]
-    assert len(lines) == 1
-    assert lines[0].endswith("(1 so far)")
-
-
-def test_white_space_is_ignored_silently(running: Robot, caplog: pytest.LogCaptureFixture) -> None:
-    """By such payloads bridges look for cycles."""
-    for topic in (DRIVE_TOPIC, SOUND, REBOOT_TOPIC):
-        running.publish(topic, " \t\n" * 8)
-    assert until(lambda: running.service.counters["blank"] == 3)
-    assert running.service.seen == []
-    assert running.service.counters["refused"] == 0
-    assert "refused" not in caplog.text
-
-
-def test_a_renamed_channel_is_received_under_its_new_name() -> None:
-    robot = Robot(serial_mcu_bridge={"topics": {"drive_values": f"{BASE}/incoming/steer"}})
-    robot.start()
-    robot.publish(DRIVE_TOPIC, '{"x": 1}')
-    robot.publish(f"{BASE}/incoming/steer", '{"x": 0.25}')
-    assert robot.saw(0.25)
-    robot.close()
+    assert sum("refused a message" in record.message for record in caplog.records) == 1
+    running.publish(REBOOT_TOPIC, " \t\n" * 8)  # by such payloads bridges look for cycles
+    assert until(lambda: running.service.counters["blank"] == 1)
+    assert running.service.counters["refused"] == 100
 
 
 # -- publishing
@@ -471,16 +423,12 @@ def test_delivery_follows_the_channel(running: Robot) -> None:
     assert running.received[0].payload == b'{"value":true}'
 
 
-def test_the_handler_of_a_pattern_receives_the_names_in_the_topic(
-    running: Robot, caplog: pytest.LogCaptureFixture
-) -> None:
-    for _ in range(3):
-        running.publish(f"{BASE}/outgoing/media-report/", '{"running": true}', retain=True)
+def test_the_handler_of_a_pattern_receives_the_names_in_the_topic(running: Robot) -> None:
+    running.publish(f"{BASE}/outgoing/media-report/", '{"running": true}', retain=True)
     running.publish(MEDIA_REPORT.topic(BASE, program="camera_publisher"), '{"running": true}')
     running.publish(MEDIA_REPORT.topic(BASE, program="audio_receiver"), '{"running": false}')
     assert running.saw(("camera_publisher", True), ("audio_receiver", False))
-    assert (running.service.counters["refused"], running.service.counters["handler_errors"]) == (3, 0)
-    assert len([record for record in caplog.records if record.message.endswith("media-report/' (1 so far)")]) == 1
+    assert (running.service.counters["refused"], running.service.counters["handler_errors"]) == (1, 0)
 
 
 LAMP = Channel(metric="lab/lamp", kind=Kind.COMMAND, payload=dict[str, Any], doc="Made while running.")
@@ -493,55 +441,33 @@ def test_a_channel_made_while_running_is_received_until_its_subscription_is_clos
     assert until(lambda: subscriptions)
     running.publish(f"{BASE}/incoming/lab/lamp", '{"value": {"on": true}}')
     assert running.saw({"on": True})
-    running.publish(f"{BASE}/incoming/lab/lamp", "[]")
-    assert until(lambda: running.service.counters["refused"] == 1)
     subscriptions[0].close()
     running.publish(f"{BASE}/incoming/lab/lamp", '{"on": false}')
     running.publish(DRIVE_TOPIC, '{"x": 0.5}')
     assert running.saw({"on": True}, 0.5)
 
 
-def test_retained_state_can_be_retracted_and_is_not_published_again(running: Robot) -> None:
-    topic = f"{BASE}/outgoing/lab/lamp"
-    running.on_service_thread(lambda: running.service.publish(GLOW, {"on": True}))
-    running.on_service_thread(lambda: running.service.publish(CHARGING_STATUS, charging(True)))
+def test_state_is_published_again_after_a_reconnect_and_streams_and_what_was_retracted_are_not(running: Robot) -> None:
+    touch, topic = TouchSensors(value=TouchValues(a0=1, a1=2, a2=3)), f"{BASE}/outgoing/lab/lamp"
+    for publication in ((GLOW, {"on": True}), (TOUCH_SENSORS, touch), (CHARGING_STATUS, charging(False))):
+        running.on_service_thread(lambda publication=publication: running.service.publish(*publication))  # type: ignore[misc]
     assert until(lambda: running.received_on(topic) and running.received_on(CHARGING_TOPIC))
     assert running.hub.retained[topic].payload == b'{"on":true}'
-    running.on_service_thread(lambda: running.service.retract(GLOW))
+    for _ in range(2):
+        running.on_service_thread(lambda: running.service.retract(GLOW))
     assert until(lambda: running.received_on(topic)[-1].payload == b"")
     assert topic not in running.hub.retained
-    running.on_service_thread(lambda: running.service.retract(GLOW))
-    running.received.clear()
-    running.hub.stop(forget=True)
-    assert until(lambda: running.service.transport.state is State.CONNECTING)
-    running.hub.start()
-    assert until(lambda: running.received_on(CHARGING_TOPIC))
-    assert not running.received_on(topic)
-
-
-def test_state_is_published_again_after_a_reconnect_and_streams_are_not(running: Robot) -> None:
-    touch = TouchSensors(value=TouchValues(a0=1, a1=2, a2=3))
-    running.on_service_thread(lambda: running.service.publish(TOUCH_SENSORS, touch))
-    running.on_service_thread(lambda: running.service.publish(CHARGING_STATUS, charging(False)))
-    assert until(lambda: len(running.received) == 2)
     running.hub.stop(forget=True)
     assert until(lambda: running.service.transport.state is State.CONNECTING)
     running.on_service_thread(lambda: running.service.publish(CHARGING_STATUS, charging(True)))
     running.received.clear()
     running.hub.start()
     assert until(lambda: running.received_on(CHARGING_TOPIC))
-    assert {message.payload for message in running.received} == {b'{"value":true}'}, "the current state, and no stream"
+    assert {message.payload for message in running.received} == {b'{"value":true}'}, "the current state, and no more"
 
 
-def test_state_is_published_again_on_the_configured_interval() -> None:
+def test_a_service_lives_without_a_broker() -> None:
     robot = Robot(defaults={"retained_publish_interval_seconds": 0.02})
-    robot.start()
-    robot.on_service_thread(lambda: robot.service.publish(CHARGING_STATUS, charging(True)))
-    assert until(lambda: len(robot.received_on(CHARGING_TOPIC)) > 3)
-    robot.close()
-
-
-def test_a_service_lives_without_a_broker(robot: Robot) -> None:
     robot.hub.stop()
     robot.operator.open(timeout=0)
     thread = threading.Thread(target=robot.service.run)
@@ -550,7 +476,8 @@ def test_a_service_lives_without_a_broker(robot: Robot) -> None:
     robot.service.post(lambda: robot.service.publish(CHARGING_STATUS, charging(True)) and None)
     robot.operator.subscribe(f"{BASE}/outgoing/#", robot.received.append)
     robot.hub.start()
-    assert until(lambda: robot.received_on(CHARGING_TOPIC))
+    assert until(lambda: len(robot.received_on(CHARGING_TOPIC)) > 3), "again and again"
     robot.service.quit()
     thread.join(10)
     assert not thread.is_alive()
+    robot.operator.close()

@@ -11,7 +11,6 @@ from pebble.services.serial_mcu_bridge.moving_sensors import MovingSensors
 CONTENTS = {
     "each differs": ("?" * 10, False),
     "the same": ("a" * 7, True),
-    "the same, not long": ("?????aaaaa", False),
     "it moved again": ("aaaaaaaab", False),
     "while it need not change": ("AAAAAAAAA", False),
     "at rest, then not long": ("AAAAAAAAAaaaa", False),
@@ -29,9 +28,7 @@ def test_contents(seconds: str, repeats: bool) -> None:
     assert check.repeats is repeats
 
 
-@pytest.mark.parametrize(
-    ("hz", "asked", "found"), [(15, 15, None), (13, 15, None), (10, 15, 10), (138, 50, 138), (19, 15, 19), (3, 0, None)]
-)
+@pytest.mark.parametrize(("hz", "asked", "found"), [(13, 15, None), (10, 15, 10), (19, 15, 19), (3, 0, None)])
 def test_rates(hz: int, asked: float, found: float | None) -> None:
     check = SourceCheck(asked)
     for number in range(2 * hz):
@@ -46,13 +43,11 @@ SENSORS = {
     "at rest": (["aaaaaaaaaa", "bbbbbbbbbb", "cccccccccc"], ".........", ""),
     "all still while driven": (["aaaaaaaaaa", "bbbbbbbbbb", "cccccccccc"], "dddddddddd", "left, right, third repeat"),
     "one of them stops": (["xxaaaaaaaaa", "xxxxxxxxxxx", "xxxxxxxxxxx"], "ddddddddddd", "left repeats its value"),
-    "one was never there": (["aaaaaaaaaa", "xxxxxxxxxx", "xxxxxxxxxx"], "dddddddddd", ""),
     "driven in short moves": (
         ["aaaaaaaaaaaaa", "bbbbbbbbbbbbb", "ccccccccccccc"],
         "dd.dd.dd.dd.dd",
         "left, right, third",
     ),
-    "it moves again": (["aaaaaaaaaax", "bbbbbbbbbbx", "ccccccccccx"], "ddddddddddd", ""),
 }
 
 

@@ -17,11 +17,9 @@ from tests.support import refused
 #: The call that is refused, its error, and what is in the file after a write; or the reason that is given.
 REFUSALS = {
     "no modes (FAT)": ("os.chmod", errno.EPERM, "new"),
-    "no modes (9p)": ("os.chmod", errno.EOPNOTSUPP, "new"),
     "no sync (SMB)": ("os.fsync", errno.EINVAL, "new"),
     "a disk that fails": ("os.fsync", errno.EIO, "Input/output error"),
     "a mount point": ("pathlib.Path.replace", errno.EBUSY, "new"),
-    "open elsewhere": ("pathlib.Path.replace", errno.EACCES, "new"),
     "another disk": ("pathlib.Path.replace", errno.EXDEV, "Invalid cross-device link"),
 }
 

@@ -26,7 +26,6 @@ from tests.commands.command_line import running
 from tests.robot.named import Hall, Named
 from tests.robot.operator import Operator, retained_messages
 from tests.robot.rig import BASE, DEVICES, STOP, Rig
-from tests.robot.test_driveable import shows
 from tests.support import ROOT, beside, free_port, further, until
 
 pytestmark = pytest.mark.alone  # whole robots
@@ -59,7 +58,7 @@ def rig(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 def started(rig: Rig) -> None:
     """Start it, and wait until it knows that its motors obey; its page takes a while on a busy machine."""
     rig.wait_until_up(rig.start(ready=False), 60)
-    assert shows(rig, "yes", seconds=60)
+    assert rig.shows_driveable("yes", seconds=60)
 
 
 def found(rig: Rig, checks: tuple[Check[RobotUnderTest], ...] = CHECKS) -> dict[str, tuple[str, str]]:

@@ -12,7 +12,6 @@ from pebble.forwarding.routing import Side
 from pebble.forwarding.service import ForwardingService
 from pebble.forwarding.side import Gate
 from pebble.runtime.connections import local_transport
-from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.transports import MqttSettings, State, Transport, ZenohSettings, create
 from tests.forwarding.virtual import SERVICES
 from tests.services.mqtt_bridge.bridge_rig import Client, Quiet, Running, make_config
@@ -120,11 +119,6 @@ class Rig:
         self.local, self.remote = self.client(LOCAL), self.client(REMOTE)
 
     @property
-    def bridge(self) -> MqttBridge:
-        assert isinstance(self.service, MqttBridge)
-        return self.service
-
-    @property
     def clients(self) -> dict[Side, Client]:
         return {LOCAL: self.local, REMOTE: self.remote}
 
@@ -132,10 +126,10 @@ class Rig:
     def gate(self) -> Gate:
         return self.service.status.gate
 
-    def client(self, side: Side, *, listen: bool = True) -> Client:
+    def client(self, side: Side) -> Client:
         """One more on that side; none receives its own messages."""
         transport = self.ends[side].transport(f"{self.robot}-{side.value}-{len(self._clients)}")
-        self._clients.append(Client(transport, self.base, listen=listen))
+        self._clients.append(Client(transport, self.base))
         return self._clients[-1]
 
     def start(self, *, ready: bool = True) -> ForwardingService:

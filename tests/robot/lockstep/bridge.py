@@ -16,9 +16,7 @@ from pebble.services.mqtt_bridge import service as bridge_module
 from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.transports import Answer, Message, clock
 from pebble.transports.mqtt.read_age import BrokerDelay
-from tests.robot.lockstep.network import Connection, Network
-from tests.robot.lockstep.processes import Process, ServiceProcess
-from tests.robot.lockstep.scheduler import Scheduler
+from tests.robot.lockstep.network import Connection, Network, Process, Scheduler, ServiceProcess
 
 _TRAVEL_S = 0.001
 _PING_S = 0.45

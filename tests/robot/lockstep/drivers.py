@@ -20,14 +20,31 @@ from pebble.contract import (
     codec,
 )
 from pebble.transports import Message, QoS
-from tests.robot.lockstep.commands import Commands
-from tests.robot.lockstep.network import Connection, Network
-from tests.robot.lockstep.processes import Process
+from tests.robot.lockstep.network import Connection, Network, Process
 
 BASE = "pebble/robots/goob"
 SCRIPT = "script"
 STRANGER = "stranger"  # all commands without a key are of one driver: nobody can tell them apart
 PERIOD_S = 0.1
+
+
+class Commands:
+    """Senders of commands by the speeds of the wheels, in thousandths: each command has its own."""
+
+    def __init__(self) -> None:
+        self._numbers = count()
+        self._senders: dict[tuple[int, int], str] = {}
+        self.grouped: set[tuple[int, int]] = set()  # those that were sent with lights
+
+    def add(self, sender: str) -> tuple[float, float]:
+        """Return ``x`` and ``z`` of a new command."""
+        number = next(self._numbers)
+        left, right = 300 + number % 697, 300 + number // 697  # 697 is a prime: neighbours differ
+        self._senders[left, right] = sender
+        return (left - right) / 2000, (left + right) / 2000
+
+    def sender_of(self, speeds: tuple[int, int]) -> str:
+        return self._senders[speeds]
 
 
 class Driver(Process):

@@ -13,8 +13,7 @@ from pebble.contract import CONTROL, CONTROL_TAKE, DRIVE
 from pebble.contract.payloads import ControlTurn, ControlVouched
 from pebble.transports import Message
 from tests.robot.lockstep.drivers import BASE, Driver
-from tests.robot.lockstep.processes import Process
-from tests.robot.lockstep.scheduler import Scheduler
+from tests.robot.lockstep.network import Process, Scheduler
 
 _REQUESTS = (CONTROL.topic(BASE), CONTROL_TAKE.topic(BASE))
 _DRIVE = DRIVE.topic(BASE)

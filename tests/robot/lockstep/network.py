@@ -1,24 +1,164 @@
-"""The memory transport without threads: messages travel as long as a schedule wants, twice, or not at all.
+"""Processes in virtual time, and the memory transport without threads between them.
 
-Messages of one sender to one receiver stay in order, as with every transport; those of two senders may overtake each
-other, but nothing overtakes what was retained before the receiver subscribed. One that is older than the silence limit
-of transports is lost together with its connection.
+What is due happens in order, at once, on one thread. Processes can be slow, frozen and killed. Messages travel as long
+as a schedule wants, twice, or not at all. Those of one sender to one receiver stay in order, as with every transport;
+those of two senders may overtake each other, but nothing overtakes what was retained before the receiver subscribed.
+One that is older than the silence limit of transports is lost together with its connection.
 """
 
 from __future__ import annotations
 
+import heapq
 from collections import deque
 from collections.abc import Callable
+from itertools import count
 from typing import Any
 
+from pebble.runtime.service import Service
 from pebble.transports import Message
 from pebble.transports.memory import MemoryHub, MemoryTransport
-from tests.robot.lockstep.processes import Process
-from tests.robot.lockstep.scheduler import Scheduler
+from tests.kit.schedules import ViolatedError
 
 _TRAVEL_S = 0.001
 _SILENCE_S = 2.0  # a connection that has been silent for so long is closed
 _RECENT = 4  # messages that a sender may send again
+
+
+class Scheduler:
+    """Jobs by the time at which they are due; two of one time run in the order in which they were added."""
+
+    def __init__(self, now: float) -> None:
+        self.now = now
+        self._heap: list[tuple[float, int, Callable[[], None]]] = []
+        self._order = count()
+        self._violated = ""
+
+    def clock(self) -> float:
+        return self.now
+
+    def at(self, due: float, job: Callable[[], None]) -> None:
+        heapq.heappush(self._heap, (max(due, self.now), next(self._order), job))
+
+    def after(self, seconds: float, job: Callable[[], None]) -> None:
+        self.at(self.now + seconds, job)
+
+    def run(self, seconds: float) -> None:
+        """Let time pass."""
+        end = self.now + seconds
+        while self._heap and self._heap[0][0] <= end:
+            self.now, _, job = heapq.heappop(self._heap)
+            job()
+            if self._violated:
+                raise ViolatedError(self._violated)
+        self.now = end
+
+    def check(self, holds: bool, rule: str) -> None:
+        """A rule: if it does not hold, that ends the run, whatever is called in between."""
+        if not holds:
+            self._violated = self._violated or rule
+            raise ViolatedError(self._violated)
+
+
+class Process:
+    """Something with a connection. What is to be done while it is frozen waits, as in a kernel."""
+
+    def __init__(self, name: str, scheduler: Scheduler) -> None:
+        self.name, self.scheduler = name, scheduler
+        self.alive = False
+        self.frozen = False
+        self.delay = 0.0  # of each message from or to it
+        self.connection: Connection | None = None
+        self.frozen_at = 0.0
+        self._waiting: list[Callable[[], None]] = []
+        self._turn_at: float | None = None
+
+    def do(self, job: Callable[[], None]) -> None:
+        """Run ``job``, of the kernel's or of a thread of the transport, as soon as the process is not frozen."""
+        if self.frozen:
+            self._waiting.append(job)
+        else:
+            job()
+
+    def wake(self) -> None:
+        """There is something to do."""
+        self.turn_at(self.scheduler.now)
+
+    def turn_at(self, due: float) -> None:
+        """Have a turn then, if none is sooner."""
+        if self.alive and (self._turn_at is None or due < self._turn_at):
+            self._turn_at = due
+            self.scheduler.at(due, lambda: self._turn_if(due))
+
+    def freeze(self) -> None:
+        if self.alive and not self.frozen:
+            self.frozen, self.frozen_at = True, self.scheduler.now
+
+    def thaw(self) -> None:
+        if not self.frozen:
+            return
+        self.frozen = False
+        if self.connection is not None:
+            self.connection.silent(self.scheduler.now - self.frozen_at)
+        waiting, self._waiting = self._waiting, []
+        for job in waiting:
+            job()
+        self._turn_at = None
+        self.wake()
+
+    def leave(self) -> None:
+        """End, however: the kernel closes the connection."""
+        self.alive = self.frozen = False
+        self._waiting, self._turn_at = [], None
+        connection, self.connection = self.connection, None
+        if connection is not None:
+            connection.network.crash(connection)
+
+    def turn(self) -> None:
+        """Do what is due; to override."""
+
+    def _turn_if(self, due: float) -> None:
+        if due == self._turn_at and self.alive and not self.frozen:
+            self._turn_at = None
+            self.turn()
+
+
+class ServiceProcess(Process):
+    """A real service, restarted by a launcher."""
+
+    def __init__(self, name: str, scheduler: Scheduler, make: Callable[[Process], Service]) -> None:
+        super().__init__(name, scheduler)
+        self._make = make
+        self.service: Service | None = None
+
+    def start(self) -> None:
+        if self.alive:
+            return
+        self.alive = True
+        self.service = self._make(self)
+        # Here all work waits for a turn of the process: a frozen one gets messages, and does nothing.
+        self.service.run_if_idle = lambda _job: False  # type: ignore[method-assign]
+        self.service.set_up()
+        self.wake()
+
+    def kill(self, restart_s: float | None) -> None:
+        """End at once; its memory is lost. ``restart_s``: when the launcher starts it again; None: not by itself."""
+        if not self.alive:
+            return
+        self.leave()
+        self.service = None
+        if restart_s is not None:
+            self.scheduler.after(restart_s, self.start)
+
+    def turn(self) -> None:
+        service = self.service
+        assert service is not None
+        while service.turn(0):
+            if not service.running:
+                raise AssertionError(f"{self.name} ends by itself")
+        wait = service.timers.wait(self.scheduler.now)
+        if wait is not None:
+            self.turn_at(self.scheduler.now + wait)
+
 
 Noted = Callable[[Process, Message], None]
 

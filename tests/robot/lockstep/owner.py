@@ -16,9 +16,7 @@ from pebble.services.serial_mcu_bridge.line.outbox import Outbox
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState
 from pebble.services.serial_mcu_bridge.text import goob_base
 from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
-from tests.robot.lockstep.network import Connection, Network
-from tests.robot.lockstep.processes import Process, ServiceProcess
-from tests.robot.lockstep.scheduler import Scheduler
+from tests.robot.lockstep.network import Connection, Network, Process, Scheduler, ServiceProcess
 
 DEADMAN_S = 1.0  # of the MCU
 _BOOT_S = 0.5

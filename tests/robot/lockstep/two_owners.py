@@ -32,13 +32,10 @@ from pebble.runtime.process import view_of
 from pebble.transports import Message, QoS
 from tests.kit.schedules import RandomSteps
 from tests.robot.lockstep.bridge import Bridge, Outside
-from tests.robot.lockstep.commands import Commands
-from tests.robot.lockstep.drivers import BASE, SCRIPT, STRANGER, Driver
+from tests.robot.lockstep.drivers import BASE, SCRIPT, STRANGER, Commands, Driver
 from tests.robot.lockstep.holders import Holders
-from tests.robot.lockstep.network import Network
+from tests.robot.lockstep.network import Network, Process, Scheduler
 from tests.robot.lockstep.owner import Disk, Owner, Wheels
-from tests.robot.lockstep.processes import Process
-from tests.robot.lockstep.scheduler import Scheduler
 from tests.robot.lockstep.stop_rules import StopRules
 
 FIRST, SECOND = "arm", "serial"  # in the config the second comes first

@@ -95,17 +95,13 @@ def _addresses(payloads: list[bytes]) -> str:
 
 ONE, TWO = ("serial",), ("serial", "tail")
 MEMBERS: dict[str, tuple[tuple[str, ...], str]] = {
-    "a robot without a motor owner": ((), "a :a>all ="),
     "a single owner": (ONE, "a :a>all =a>serial serial?a =a>serial serial+a = a ="),
-    "one that was never heard": (ONE, "a 300s =a>serial"),
     "two owners": (TWO, "a =a>serial,a>tail serial+a =a>tail tail?a =a>tail tail+a ="),
     "of an owner that restarts": (ONE, "serial0 a =a>serial serial0 =a>serial serial+a ="),
     "killed before its file is written": (ONE, "a serial?a serial0 =a>serial serial+a ="),
-    "frozen, a newer state before it": (ONE, "a serial+b =a>serial serial+a ="),
     "whose state shows it reset before it was saved": (ONE, "a serial?a serial-a ="),
     "that was reset by an older command at its thaw": (ONE, "serial+b a serial-b =a>serial serial+a ="),
     "that cannot save": (ONE, "a serial*a = serial0 ="),
-    "whose state names it before it is passed": (ONE, "serial+a a ="),
     "the newest counts": (ONE, "a b =b>serial"),
     "newest is who was passed first last": (ONE, "a b a =b>serial serial+b ="),
     "a bridge that restarts forgets": (TWO, "a bridge ="),
@@ -113,10 +109,8 @@ MEMBERS: dict[str, tuple[tuple[str, ...], str]] = {
     "a withdrawn owner is given up": (TWO, "serial! a 59s serial! 1s serial0 =a>tail a :a>all"),
     "a copy after a reset goes to nobody": (ONE, "a serial+a serial-a a : ="),
     "a copy goes to the owner that was not reset": (TWO, "a serial+a tail+a serial-a a :a>tail"),
-    "a copy after a reset that was not shown latched": (ONE, "serial0 a serial-a a : ="),
     "a copy that waits passes": (TWO, "a serial?a b serial?b serial-b b :b>tail"),
     "a restart proves no reset": (ONE, "a serial+a serial0 a :a>all =a>serial"),
-    "a new stop after a reset": (ONE, "a serial+a serial-a b :b>all =b>serial"),
     "names have a bound, stops have none": (ONE, "a serial+a serial-a fill a : b a :a>all =b>serial"),
 }
 
@@ -139,9 +133,7 @@ def test_a_stop_that_is_given_up_is_told_once() -> None:
     ("raw", "by", "why"),
     [
         (b"{}", "", ""),
-        (b"\xff", "", ""),
         (b'{"stop": "x", "by": "ann", "why": "dog"}', "ann", "dog"),
-        (b'{"value": {"by": "ann"}}', "ann", ""),
         (b"x" * 100_000, "", ""),
     ],
 )
@@ -161,15 +153,13 @@ def test_only_the_bridge_says_for_whom_one_is() -> None:
     assert named(payload("a", owner="tail", by="ann")) == payload("a", by="ann")
 
 
-@pytest.mark.parametrize("mirroring", [False, True])
-def test_the_bridge_repeats_it_on_the_robots_side_only(monkeypatch: pytest.MonkeyPatch, *, mirroring: bool) -> None:
+def test_the_bridge_repeats_it_on_the_robots_side_only(monkeypatch: pytest.MonkeyPatch) -> None:
     world = World("bridge", monkeypatch)
     serial, tail = ({"enabled": True, "serial": {"port": f"/dev/{name}"}} for name in TWO)
     world.start(serial={**serial, "instances": {"tail": tail}})
     world.run()
-    if mirroring:
-        world.local.publish("incoming/flags/remote-mirror", b"true", retain=True)
-        world.run()
+    world.local.publish("incoming/flags/remote-mirror", b"true", retain=True)
+    world.run()
     world.remote.publish(STOP, b"{}")
     world.run(1.9)
     first, *repeated = [codec.decode(ESTOP, one) for one in world.local.payloads(STOP)]
