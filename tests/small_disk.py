@@ -18,8 +18,15 @@ class SmallDisk:
 
     def mount(self, *options: str) -> None:
         """Mount an empty one, over an earlier one, which is hidden."""
-        how = ",".join((f"size={self._size}m", "mode=755", *options))
-        words = ["mount", "-t", "tmpfs", "-o", how, "none", str(self.root)]
+        words = [
+            "mount",
+            "-t",
+            "tmpfs",
+            "-o",
+            ",".join((f"size={self._size}m", "mode=755", *options)),
+            "none",
+            str(self.root),
+        ]
         subprocess.run(words, check=True)
         self._mounts += 1
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
+import pty
 import re
 import signal
+import socket
 import ssl
 import subprocess
 import urllib.error
@@ -37,8 +40,9 @@ def requested(url: str) -> str:
 
 
 @pytest.mark.solo
-def test_all_robots_do_what_they_are_commanded(demos: list[Demo], temporary: Path) -> None:
-    demo = start(demos, temporary, f"{SHORTEST_S}, embedded=True")
+@pytest.mark.parametrize("embedded", [True, pytest.param(False, marks=pytest.mark.thorough)])
+def test_all_robots_do_what_they_are_commanded(demos: list[Demo], temporary: Path, embedded: bool) -> None:
+    demo = start(demos, temporary, f"{SHORTEST_S}, embedded={embedded}")
     page = page_of(demo)
     assert re.findall(r"https?:|[\"'=(]//", requested(page)) == []  # everything it loads is on its own server
     assert until(lambda: requested(f"{page}healthz") == "ok")
@@ -111,6 +115,36 @@ def pasted(line: str, output: Path) -> Iterator[Callable[[], str]]:
         assert running.wait(20) in (0, 130), log.read_text()
 
 
+@pytest.mark.thorough
+def test_a_phone_can_log_in_and_a_closed_terminal_ends_everything_though_its_signal_goes_elsewhere(
+    demos: list[Demo], temporary: Path
+) -> None:
+    """SIGHUP reaches the session leader, for example make, which only waits."""
+    ours, terminal = pty.openpty()
+    demo = start(demos, temporary, "for_phones=True", terminal)
+    os.close(terminal)
+    shown = bytearray()
+
+    def shows(text: bytes) -> bool:
+        shown.extend(os.read(ours, 65536))  # a frame comes ten times a second
+        return text in shown
+
+    try:
+        assert until(lambda: shows(b"forward, stop"), START_S), shown
+        ((host, port),) = re.findall(rb"in a browser: https://([^:/]+):(\d+)/", shown)
+        (broker,) = set(re.findall(rb"mqtt://127.0.0.1:(\d+)", shown))
+        assert re.findall(rb"Log in as visitor with the password \w{8}\r", shown)
+        assert "Log in" in requested(f"https://127.0.0.1:{int(port)}/")
+        with pytest.raises(OSError):  # the broker is on loopback
+            socket.create_connection((host.decode(), int(broker)), 5)
+    finally:
+        os.close(ours)
+    assert demo.process.wait(END_S) == 0, demo.output
+    assert demo.output == ""
+    assert demo.leftovers() == []
+    assert demo.folders() == []
+
+
 def test_nothing_outlives_a_demo_that_is_killed(demos: list[Demo], temporary: Path) -> None:
     demo = start(demos, temporary, "")
     assert until(lambda: "forward, stop" in demo.output, START_S), demo.output
@@ -118,3 +152,19 @@ def test_nothing_outlives_a_demo_that_is_killed(demos: list[Demo], temporary: Pa
     demo.process.kill()
     demo.process.wait(10)
     assert until(lambda: demo.leftovers() == [], END_S), demo.leftovers()
+
+
+def test_a_robot_that_does_not_come_up_is_a_failure_with_a_place_to_look(demos: list[Demo], temporary: Path) -> None:
+    code = """
+import sys
+import pebble.extensions.lab.demo.main as main
+import pebble.extensions.lab.rig.testbed as testbed
+main._DISCOVERY_S = 1.0
+testbed.LinuxRobot.bring_up = lambda self, ending: None
+sys.exit(main.run(main.SHORTEST_S))
+"""
+    demos.append(Demo(temporary, code))
+    assert demos[0].process.wait(START_S) == 1
+    assert "goob did not become ready to drive" in demos[0].output
+    (folder,) = demos[0].folders()
+    assert str(folder) in demos[0].output

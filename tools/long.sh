@@ -10,7 +10,7 @@ tool() { PYTHONPATH=.venv/tools $python "$@"; }
 list() {
     cat <<END
 make long PART=stops      400 random schedules of people, stops, scripts and faults with whole robots, two hours
-make long PART=soak       kills, freezes and other faults while an operator drives; MINUTES=30 for each transport
+make long PART=soak       floods, kills, freezes, full disks and more while an operator drives; MINUTES=30 for each transport
 make long PART=schedules  random schedules in virtual time, an hour
 make long PART=page       every state, card, interruption and finger at the operator page in Chromium, 25 minutes
 make long PART=engines    drive and stop a robot at the page in Firefox and WebKitGTK, and a demo in Firefox and Chromium, ten minutes

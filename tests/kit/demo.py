@@ -22,7 +22,7 @@ MARK = "PEBBLE_TEST_DEMO"
 class Demo:
     """A run of the demo. All its processes inherit a variable that marks them."""
 
-    def __init__(self, folder: Path, code: str) -> None:
+    def __init__(self, folder: Path, code: str, terminal: int | None = None) -> None:
         self.temporary = folder
         self.log = folder / "demo.log"
         self._mark = uuid.uuid4().hex
@@ -31,7 +31,7 @@ class Demo:
                 [sys.executable, "-c", code],
                 cwd=ROOT,
                 env={**os.environ, MARK: self._mark, "TMPDIR": str(folder)},
-                stdout=output,
+                stdout=output if terminal is None else terminal,
                 stderr=output,
             )
 
@@ -85,9 +85,9 @@ def demos(temporary: Path) -> Iterator[list[Demo]]:
         demo.end()
 
 
-def start(demos: list[Demo], folder: Path, arguments: str) -> Demo:
+def start(demos: list[Demo], folder: Path, arguments: str, terminal: int | None = None) -> Demo:
     imports = "import sys; from pebble.extensions.lab.demo.main import run"
-    demos.append(Demo(folder, f"{imports}; sys.exit(run({arguments}))"))
+    demos.append(Demo(folder, f"{imports}; sys.exit(run({arguments}))", terminal))
     return demos[-1]
 
 

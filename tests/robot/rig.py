@@ -113,8 +113,8 @@ class Rig:
 
     The robot reaches the remote broker through ``uplink``, a proxy that can fail. With ``direct`` it connects without
     the proxy, because a proxy acknowledges TCP segments itself and so changes the timing. ``remote`` replaces its own
-    broker, ``operator`` its operator. ``scripts``: which of ours it has. ``top``: more sections of the config; others
-    are services'.
+    broker, ``operator`` its operator, who subscribes to ``listens`` below the robot's base. ``scripts``: which of ours
+    it has. ``top``: more sections of the config; others are services'.
     """
 
     def __init__(
@@ -127,6 +127,7 @@ class Rig:
         start: bool = True,
         direct: bool = False,
         remote: Broker | None = None,
+        listens: str = "#",
         operator: Operator | None = None,
         scripts: tuple[str, ...] = (),
         top: dict[str, Any] | None = None,
@@ -153,7 +154,7 @@ class Rig:
         self.config.write_text(json.dumps(self._config(), indent=1))
         self.log = self.folder / "robot.log"
         self._robot: subprocess.Popen[bytes] | None = None
-        self.operator = operator or Operator(self.remote.port, f"pebble/robots/{name}")
+        self.operator = operator or Operator(self.remote.port, f"pebble/robots/{name}", listens)
         if start:
             try:
                 self.start()

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from tests.robot.rig import STOP, Rig
-from tests.support import gone, until
+from tests.support import further, gone, until
 
 pytestmark = pytest.mark.alone  # deadlines are checked
 
@@ -31,7 +31,7 @@ def rigs() -> Iterator[Callable[[str], Rig]]:
     """Robots by their transport, each started when it is first needed."""
 
     def opened(kind: str) -> Rig:
-        rig = stack.enter_context(Rig(kind, mirror=kind == "zenoh", direct=True, scripts=("cruise", "follow")))
+        rig = stack.enter_context(Rig(kind, mirror=kind == "zenoh", direct=True, scripts=("cruise", "flood", "follow")))
         assert until(rig.lists_scripts, 60), rig.log.read_text()[-3000:]
         return rig
 
@@ -49,6 +49,12 @@ def driving(rig: Rig, file: str = "cruise", config: dict[str, Any] | None = None
     began = rig.run_script(file, config)
     assert until(lambda: rig.script().get("running") and rig.mcu.moving(began), 15), rig.log.read_text()[-3000:]
     return int(rig.script()["pid"])
+
+
+def idle(rig: Rig) -> None:
+    """End the script, and wait until it has ended and the wheels stand."""
+    rig.end_script()
+    assert until(lambda: not rig.script().get("running") and not rig.mcu.turning(), 15)
 
 
 def rested_s(rig: Rig, since: float) -> float:
@@ -73,8 +79,8 @@ def launcher_killed(rig: Rig, _pid: int) -> None:
 #: Ways to end a script: what does it, the most seconds until the wheels rest, and until its process has ended.
 ENDINGS: dict[str, tuple[Callable[[Rig, int], object], float, float]] = {
     "killed": (lambda _rig, pid: os.kill(pid, signal.SIGKILL), AT_ONCE_S, 1.0),
+    "SIGTERM": (lambda _rig, pid: os.kill(pid, signal.SIGTERM), AT_ONCE_S, 1.0),
     "stopped": (lambda rig, _pid: rig.end_script(), AT_ONCE_S, 1.0),
-    "a person's zero": (lambda rig, _pid: rig.operator.send(DRIVE, {"x": 0, "z": 0}), AT_ONCE_S, 3.0),
     "frozen": (freeze, 1.5, 6.0),
     "manager killed": (lambda rig, _pid: rig.kill("autonomy_manager"), AT_ONCE_S, 1.0),
     "launcher killed": (launcher_killed, AT_ONCE_S, 1.0),
@@ -104,6 +110,17 @@ def test_the_wheels_rest_however_a_script_ends(rig: Rig, ending: str) -> None:
         assert until(lambda: not rig.script()["running"], 10)
 
 
+@pytest.mark.parametrize("rig", ["zenoh", further("mqtt")], indirect=True)
+def test_one_stop_of_a_person_is_enough(rig: Rig) -> None:
+    """Against a script that publishes 500 commands a second."""
+    driving(rig, "flood")
+    began = time.monotonic()
+    rig.operator.send(DRIVE, {"x": 0, "z": 0})
+    rested = rested_s(rig, began)
+    idle(rig)
+    assert rested <= AT_ONCE_S
+
+
 def control(rig: Rig, **wanted: Any) -> dict[str, Any]:
     """Ask for control, and return the state of the motor owner."""
     rig.operator.send(CONTROL, {**MIA, **wanted})
@@ -111,7 +128,7 @@ def control(rig: Rig, **wanted: Any) -> dict[str, Any]:
 
 
 def test_a_person_with_control_goes_before_a_script_of_the_original(rig: Rig) -> None:
-    """Which knows nothing of signatures."""
+    """Which knows nothing of signatures; every end of it stops the wheels, too."""
     pid = driving(rig, "follow")
     assert until(lambda: control(rig).get("id") == MIA["id"], step=0.1)
     key, began = control(rig)["key"], time.monotonic()
@@ -130,3 +147,9 @@ def test_a_person_with_control_goes_before_a_script_of_the_original(rig: Rig) ->
     assert until(lambda: not rig.mcu.moving(stopped) and rig.mcu.drives(stopped), 1)
     assert until(lambda: gone(pid), 2)
     assert until(lambda: rig.script()["running"] is False)
+
+    pid = driving(rig, "follow")
+    killed = rig.kill("autonomy_manager")
+    assert until(lambda: gone(pid), 1)
+    assert rested_s(rig, killed) < 0.9
+    assert until(lambda: rig.lists_scripts(killed), 60)

@@ -1,4 +1,4 @@
-"""A whole robot whose operators have accounts at a Zenoh hub."""
+"""A whole robot whose operators have accounts at a Zenoh hub: that of the operators, or its own."""
 
 from __future__ import annotations
 
@@ -14,13 +14,15 @@ from typing import Any
 import pytest
 
 from pebble.config import load
+from pebble.extensions.fleet import certificates
+from pebble.extensions.fleet.folder import ZENOH
 from pebble.runtime.connections import local_transport
 from pebble.transports import Message, QoS, ZenohSettings, create
 from tests.ext.fleet.test_attempts import GOOB
 from tests.ext.fleet.test_zenoh import Hall
 from tests.robot.operator import ReceivedMessage
 from tests.robot.rig import Rig
-from tests.support import beside, cases, until
+from tests.support import beside, cases, further, until
 
 pytestmark = pytest.mark.alone  # stops are timed
 
@@ -55,11 +57,43 @@ def at_the_operators_hub(hall: Hall) -> Iterator[Rig]:
         with Rig("zenoh", name="goob", operator=operator, start=False) as rig:
             raw = json.loads(rig.config.read_text()) | {"security": {"level": "named", "strangers": "free"}}
             raw["services"]["mqtt_bridge"] = {"enabled": True, "remote": remote, "link": {"groups": True}}
-            rig.config.write_text(json.dumps(raw))
-            rig.config.chmod(0o600)
-            rig.start()
+            started(rig, raw)
             assert until(lambda: "have a connection of their own" in rig.log.read_text(), 20)
             yield rig
+
+
+@contextmanager
+def at_its_own_hub(hall: Hall) -> Iterator[Rig]:
+    files = {
+        "ca_cert": certificates.CA_CERT,
+        "client_cert": certificates.SERVER_CERT,
+        "client_key": certificates.SERVER_KEY,
+    }
+    tls = {"enabled": True, **{name: str(hall.folder / file) for name, file in files.items()}}
+    with Rig("zenoh", name="goob", start=False) as rig:
+        raw = json.loads(rig.config.read_text())
+        raw["transport"] |= {"listen": [hall.endpoint], "access": str(hall.folder / ZENOH), "tls": tls}
+        started(rig, raw)
+        yield rig
+
+
+def started(rig: Rig, raw: dict[str, Any]) -> None:
+    rig.config.write_text(json.dumps(raw))
+    rig.config.chmod(0o600)
+    rig.start()
+
+
+def test_a_group_of_commands_passes_over_zenoh(tmp_path: Path) -> None:
+    hall, group = Hall(tmp_path / "hall", "named"), {"drive-values": {"z": 0.3}, "lights-solid": {"g": 1}}
+    with at_the_operators_hub(hall) as rig, closing(create("zenoh", "otto", hall.settings("otto")).open(10)) as otto:
+
+        def turns() -> bool:
+            otto.publish(f"{GOOB}/incoming/by/otto/group", json.dumps(group).encode(), qos=QoS.DELIVERED)
+            return until(rig.mcu.turning, 0.3)
+
+        assert until(turns, 20)
+        lines = [entry.line for entry in rig.mcu.entries() if entry.event == "line"]
+        assert "M 0.300 0.300, L 0.000 1.000 0.000" in ", ".join(lines), "one write"
 
 
 class Program:
@@ -99,38 +133,39 @@ class Program:
         self._here.publish(f"{GOOB}/incoming/{metric}", json.dumps(body).encode(), qos=QoS.DELIVERED, urgent=True)
 
 
-def test_small_messages_of_another_account_hold_up_no_stop(tmp_path: Path) -> None:
-    """A viewer sends more than the robot reads; a stop that is sent once stops it.
+@pytest.mark.parametrize(
+    ("where", "level", "floods", "metric"),
+    [
+        (at_the_operators_hub, "named", "vera", "by/vera/front-camera"),
+        (at_its_own_hub, "login", "otto", "drive-values"),
+        further(at_the_operators_hub, "named", "lan", "from/fred/drive-values"),
+        further(at_the_operators_hub, "named", "gate", "by/vera/front-camera"),
+    ],
+)
+def test_small_messages_of_another_account_hold_up_no_stop(
+    where: Any, level: Any, floods: str, metric: str, tmp_path: Path
+) -> None:
+    """A viewer, a neighbour, a gateway, or at the robot's own hub a driver, sends more than the robot reads; a stop
+    that is sent once stops it.
 
     It came seconds later or not at all: behind what waits for the robot, as too old, or with the connection that a hub
-    closes where there is no room. Before, a group of commands passes, in one write to the board.
+    closes where there is no room.
     """
-    hall, took = Hall(tmp_path / "hall", "named"), list[float]()
+    hall, took = Hall(tmp_path / "hall", level), list[float]()
+    by = "by/sam/" if level == "named" else ""
     with ExitStack() as opened:
-        rig = opened.enter_context(at_the_operators_hub(hall))
-        otto, sam = (
-            opened.enter_context(closing(create("zenoh", name, hall.settings(name)).open(10)))
-            for name in ("otto", "sam")
-        )
-        group = json.dumps({"drive-values": {"z": 0.3}, "lights-solid": {"g": 1}}).encode()
-
-        def turns() -> bool:
-            otto.publish(f"{GOOB}/incoming/by/otto/group", group, qos=QoS.DELIVERED)
-            return until(rig.mcu.turning, 0.3)
-
-        assert until(turns, 20)
-        lines = [entry.line for entry in rig.mcu.entries() if entry.event == "line"]
-        assert "M 0.300 0.300, L 0.000 1.000 0.000" in ", ".join(lines), "one write"
+        rig = opened.enter_context(where(hall))
+        sam = opened.enter_context(closing(create("zenoh", "sam", hall.settings("sam")).open(10)))
         program = Program(rig, opened)
-        flooded = f"{GOOB}/incoming/by/vera/front-camera"
-        opened.enter_context(hall.account("vera", topics=[flooded], flood="messages"))
-        assert until(lambda: "front-camera" in rig.log.read_text(), 10)
+        opened.enter_context(hall.account(floods, topics=[f"{GOOB}/incoming/{metric}"], flood="messages"))
+        assert until(lambda: "front-camera" in rig.log.read_text() or not metric.endswith("camera"), 10)
         name = ""
         for number in range(cases(3, 20)):
             program.drive(name)
             name, pressed = f"f{number:015x}", time.monotonic()
-            stop = json.dumps({"stop": name}).encode()
-            sam.publish(f"{GOOB}/incoming/by/sam/estop", stop, qos=QoS.DELIVERED, urgent=True)
+            sam.publish(
+                f"{GOOB}/incoming/{by}estop", json.dumps({"stop": name}).encode(), qos=QoS.DELIVERED, urgent=True
+            )
             assert until(lambda: not rig.mcu.turning(), 20), took
             took.append(time.monotonic() - pressed)
     assert statistics.median(took) < 3, took
