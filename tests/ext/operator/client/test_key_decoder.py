@@ -14,17 +14,12 @@ from pebble.extensions.operator.client.terminal.key_decoder import ALONE_S, KeyD
         (b" !q", ["space", "!", "q"]),
         (b"\x04", ["end"]),
         (b"\x1b[A\x1b[B\x1b[C\x1b[D", ["up", "down", "right", "left"]),
-        (b"\x1bOA\x1bOD", ["up", "left"]),
         (b"\x1b\x1b[A", ["escape", "up"]),  # Escape and an arrow, or Alt and an arrow
-        (b"\x1b\x1b\x1b[A", ["escape", "escape", "up"]),
         (b"\x1b!", ["escape", "!"]),
-        (b"\x1b ", ["escape", "space"]),
         (b"\x1bw", ["escape", "w"]),  # or Alt and W
-        (b"w\x1b\x1bw", ["w", "escape", "escape", "w"]),
         (b"\x1b[1;2A", []),  # shift and an arrow
         (b"\x1b[5~w", ["w"]),
         (b"\x1b[[Aw", ["w"]),  # the first function key of the Linux console
-        (b"\x1b[200~w\x1b[201~", ["w"]),
         ("ä€\x00\r\n\t\x7f".encode(), ["ä", "€"]),
         (b"\x1b[" + b"0" * 100 + b"w", []),
     ],

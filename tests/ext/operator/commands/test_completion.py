@@ -50,21 +50,12 @@ def bash(folder: Path, line: str) -> list[str]:
 @pytest.mark.parametrize(
     ("line", "offered"),
     [
-        ("pebble est", ["estop"]),
-        ("pebble fleet h", ["hub"]),
         ("pebble up h", ["hall.json"]),
         ("pebble up notes", []),
         ("pebble drive goo", ["goob"]),
-        ("pebble drive ", ["broken.json", "hall.json", "lamp.json", "list.json", "goob", "minilamp"]),
-        ("pebble estop reset mini", ["minilamp"]),
         ("pebble topic echo online -r goo", ["goob"]),
-        ("pebble topic echo online --config lam", ["lamp.json"]),
         ("pebble script start hall.json da", ["dance"]),
         ("pebble script start goob whe", ["wheel-odometry"]),
-        ("pebble sim mini", ["minilamp"]),
-        ("pebble web us", ["user"]),
-        ("pebble conform mini", ["minilamp"]),
-        ("pebble doctor --may", ["--may-move"]),
     ],
 )
 def test_bash_completes_a_word(folder: Path, line: str, offered: list[str]) -> None:
