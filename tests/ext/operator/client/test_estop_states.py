@@ -133,14 +133,6 @@ def test_a_reset_reports_owners_that_have_restarted_or_are_silent() -> None:
     assert reset.refusals()["right"] == "the reset reached it too late"
 
 
-def test_only_stopped_owners_are_reset() -> None:
-    robot, estop = stopped("left", "right")
-    latch = robot.owners[0].latch
-    assert latch.reset(latch.boot, latch.count, age=0, now=0)
-    publish(estop, [robot.owners[0].state()])
-    assert list(Reset(estop, "").shown) == ["right"]
-
-
 WHY = "serial: no /dev/ttyACM0"
 
 

@@ -64,19 +64,6 @@ def test_two_are_under_way_and_one_when_acknowledgements_are_late() -> None:
     assert queue.window == 2
 
 
-@pytest.mark.parametrize(("size", "most"), [(100, 8), (1000, 4), (3000, 2)])
-def test_more_are_under_way_if_they_are_small(size: int, most: int) -> None:
-    queue, taken = ViewerQueue(ALL, 0.0), 0
-    for seq in range(20):
-        queue.offer(frame(seq, keyframe=True, size=size))
-        taken += queue.take(0.0) is not None
-    assert taken == most
-    queue.acknowledge(0, 1.0)
-    queue.offer(frame(20, keyframe=True, size=4000))
-    assert queue.window == 1
-    assert queue.take(1.0) is None
-
-
 def test_a_key_frame_replaces_what_waits_for_a_slow_page_only() -> None:
     fast, slow = ViewerQueue(ALL, 0.0), ViewerQueue(ALL, 0.0)
     for queue, took in ((fast, 0.01), (slow, 0.5)):
@@ -204,15 +191,6 @@ def test_over_a_thin_connection_small_pictures_come_from_the_rescue_stream() -> 
     assert viewer.rescued
     assert offered(viewer, 2, now + 59)
     assert not offered(viewer, 3, now + 61)
-
-
-def test_small_pictures_that_are_late_as_well_do_not_put_off_the_return() -> None:
-    viewer = ViewerQueue(ALL, 0.0)
-    for seq in range(18):
-        show(viewer, seq, seq / 2, seq / 2 + 0.5)
-        assess([viewer], "pbvd", seq / 2 + 0.5, can_rescue=True)
-        assert viewer.rescued == (seq > 0)
-    assert not offered(viewer, 18, 61.0)
 
 
 # -- the encoding

@@ -7,15 +7,13 @@ import pytest
 from msgspec import UNSET
 
 from pebble.contract import LINK, ONLINE
-from pebble.contract.levels import LEVELS, link_of, silent_after
+from pebble.contract.levels import LEVELS, silent_after
 from pebble.contract.payloads import Drive, LinkLevel, LinkState
 from pebble.extensions.operator.client.discovery import Discovery
 from pebble.extensions.operator.client.estop import COLLECT_S, StopSender, new_name
-from pebble.extensions.operator.client.names import Names
 from pebble.extensions.operator.client.pace_of_link import WIDE, Pace, pace_of
 from pebble.extensions.operator.client.robot_view import RobotView
-from pebble.extensions.operator.client.scripts import RobotScripts
-from pebble.transports import Message, QoS
+from pebble.transports import QoS
 from tests.ext.operator.client.estop_robot import outgoing
 
 GOOB = "pebble/robots/goob"
@@ -48,11 +46,6 @@ def test_a_robot_asks_for_a_pace(state: LinkState | None, step_s: float, qos: Qo
     assert pace.stamped is (qos is QoS.LATEST)
 
 
-@pytest.mark.parametrize("payload", [b"", b'{"level": "slow", "drive_hz": 1, "rtt_ms": 1, "queue_ms": 1, "t": 1}'])
-def test_a_link_that_cannot_be_read_carries_everything(payload: bytes) -> None:
-    assert pace_of(link_of(payload)) is WIDE
-
-
 @pytest.mark.parametrize(
     ("pace", "drive", "expected"),
     [
@@ -81,35 +74,9 @@ def test_who_drives_keeps_to_the_pace_of_a_link_that_is_lost_for_a_while() -> No
 # -- who waits how long for a robot's silence, or for its answer
 
 
-NEAR_S = 0.1
-
-
-def link_message(level: LinkLevel) -> Message:
-    return outgoing(GOOB, "link", msgspec.to_builtins(link(level, 4)), retain=True)
-
-
-def heartbeat() -> Message:
-    return outgoing(GOOB, "online", {"t": 1})
-
-
-@pytest.mark.parametrize(("level", "limit_s"), {"wide": 2, "narrow": 3, "thin": 5}.items())
-def test_a_robot_whose_link_is_known_is_awaited_for(level: LinkLevel, limit_s: float) -> None:
-    discovery = Discovery()
-    discovery.receive(link_message(level), 0.0, 0.0)
-    assert [discovery.awaits_heartbeat(limit_s + more_s) for more_s in (-NEAR_S, NEAR_S)] == [True, False]
-    assert limit_s == silent_after(link=level)
-
-
-@pytest.mark.parametrize(("level", "scripts_s", "others_s"), [("wide", 5, 2), ("narrow", 10, 10), ("thin", 10, 10)])
-def test_an_answer_is_awaited_for(level: LinkLevel, scripts_s: float, others_s: float) -> None:
-    scripts = RobotScripts(Names(GOOB))
-    scripts.receive(link_message(level))
-    assert (scripts.answer_s, pace_of(link_of(link_message(level).payload)).answer_s) == (scripts_s, others_s)
-
-
 def test_a_stop_of_all_waits_for_silent_robots_as_on_the_thinnest_link() -> None:
     stop = StopSender(new_name(), by="ann", why="", now=0.0, robots=None)
-    stop.receive(heartbeat(), COLLECT_S - NEAR_S)
+    stop.receive(outgoing(GOOB, "online", {"t": 1}), COLLECT_S - 0.1)
     assert list(stop.robots) == [GOOB]
     assert max(silent_after(link=level) for level in LEVELS) == COLLECT_S
 
@@ -117,6 +84,6 @@ def test_a_stop_of_all_waits_for_silent_robots_as_on_the_thinnest_link() -> None
 def test_a_first_robot_is_awaited_as_one_of_which_nothing_is_known() -> None:
     assert [Discovery().awaits_heartbeat(after_s) for after_s in (1.9, 2.1)] == [True, False]
     discovery = Discovery()
-    discovery.receive(link_message("thin"), 0.0, 0.0)
-    discovery.receive(heartbeat(), 1.0, 1.0)
+    discovery.receive(outgoing(GOOB, "link", msgspec.to_builtins(link("thin", 4)), retain=True), 0.0, 0.0)
+    discovery.receive(outgoing(GOOB, "online", {"t": 1}), 1.0, 1.0)
     assert not discovery.awaits_heartbeat(1.0)

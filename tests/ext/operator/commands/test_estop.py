@@ -250,12 +250,9 @@ def test_a_config_file_leads_to_the_robots_own_side_and_to_the_remote_one(
 @pytest.mark.parametrize(
     ("arguments", "code", "named"),
     [
-        (("goob",), 1, "goob is not a config file"),
         (("--all",), 1, "--config CONFIG or --url URL"),
         (("--hold", "--url", "mqtt://127.0.0.1:1"), 2, "--all"),
         (("goob", "--all", "--url", "mqtt://127.0.0.1:1"), 2, "either --all or goob"),
-        (("goob", "fred", "--url", "mqtt://127.0.0.1:1"), 2, "one robot at a time"),
-        (("reset", "--url", "mqtt://127.0.0.1:1"), 2, "name the robot"),
         ((), 2, "nothing was stopped: name the robot, or add --all"),
         (("stauts", "goob", "--url", "mqtt://127.0.0.1:1"), 2, 'did you mean "pebble estop status goob"?'),
         (("reset", "--all", "--url", "mqtt://127.0.0.1:1"), 2, "not for reset"),
