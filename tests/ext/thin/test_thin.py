@@ -185,19 +185,6 @@ class TestNoRoom:
         assert world.service.status.counts["shed"] == world.service.dropped()["shed"]
         assert len([line for line in caplog.messages if "has no room" in line]) == 1
 
-    def test_what_is_lost_with_a_connection_comes_with_the_next(self, start: Start) -> None:
-        world = start()
-        world.uplink.way = FULL
-        world.run(0.2)
-        world.local.publish(STATUS, b"newest", retain=True)
-        world.run(0.2)
-        world.uplink.cut()
-        world.uplink.way = FREE
-        world.run(3)
-        world.uplink.mend()
-        world.run(3)
-        assert world.retained(STATUS)[1] == b"newest"
-
 
 class TestFloods:
     """Commands of clients that do not follow the link, all of them late when they come."""

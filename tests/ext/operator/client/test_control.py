@@ -154,18 +154,6 @@ def test_control_can_be_taken_and_who_has_lost_it_does_not_take_it_back() -> Non
     assert requests(world.sent).count(("control/take", "hold")) == 1
 
 
-def test_a_motor_owner_that_is_started_again_gives_control_anew() -> None:
-    world = World()
-    ann = world.holder()
-    before = ann.decided
-    world.robot.owners[0].start(world.now)
-    world.receive(world.robot.states())
-    assert (ann.held, ann.key) == (False, "")
-    world.wait(STEP_S)
-    assert ann.held
-    assert ann.decided != before
-
-
 # -- several motor owners
 
 

@@ -10,8 +10,6 @@ from pebble.errors import PebbleError
 from pebble.extensions.operator.client.named_topics import NamedTopics, NoNameError
 from pebble.extensions.operator.client.names import Names, base_of
 from pebble.transports import Message, QoS
-from pebble.transports.memory import MemoryHub, MemoryTransport
-from tests.support import until
 
 GOOB, FRED = "pebble/robots/goob", "pebble/robots/fred"
 
@@ -117,20 +115,3 @@ def test_the_clients_own_name_is_not_sent_twice() -> None:
         assert json.loads(named.payload) == {"id": "1"}
     (named,) = topics("ann", GOOB).forms(Message(f"{GOOB}/incoming/control", b'{"id":"1","by":"anna"}'))
     assert json.loads(named.payload) == {"id": "1", "by": "anna"}
-
-
-def test_a_transport_publishes_the_forms_and_a_robot_may_change_its_level_meanwhile() -> None:
-    named, received = {GOOB}, []
-    hub = MemoryHub()
-    with MemoryTransport("robot", hub) as robot, MemoryTransport("client", hub) as client:
-        robot.subscribe(f"{GOOB}/incoming/#", lambda one: received.append(one.topic[len(GOOB) + 10 :]), direct=True)
-        client.policy.forms = NamedTopics("ann", lambda base: base in named).forms
-        flag, estop = f"{GOOB}/incoming/flags/mqtt-video", f"{GOOB}/incoming/estop"
-        assert client.publish(flag, b"true", qos=QoS.DELIVERED, retain=True)
-        assert client.publish(estop, b"{}", qos=QoS.DELIVERED)
-        named.clear()
-        assert client.publish(estop, b"{}", qos=QoS.DELIVERED)
-        assert until(lambda: received == ["by/ann/flags/mqtt-video", "estop", "by/ann/estop", "estop"])
-        late: list[str] = []
-        robot.subscribe(f"{GOOB}/incoming/#", lambda one: late.append(one.topic), direct=True)
-        assert late == [], "nothing is retained at a topic with a name"

@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import logging
-import runpy
 import subprocess
 import sys
-import time
 from functools import cache
 from pathlib import Path
 from runpy import run_path
 from types import SimpleNamespace
 from typing import Any
-from unittest.mock import Mock
 
 import pytest
 
-from pebble.config import parse
 from pebble.extensions.scripts.perception.odometry import OdometrySettings
-from pebble.extensions.scripts.script import Stopped
 from tests.support import ROOT
 
 SCRIPTS = ROOT / "pebble/extensions/scripts/shipped"
@@ -111,18 +105,3 @@ def test_the_calibration_of_its_folder_counts_unless_options_say_otherwise(
 def test_the_tags_size_must_be_given_or_confirmed() -> None:
     (entry,) = (entry for entry in described("apriltag-follow")["configs"] if entry["key"] == "tag_size_m")
     assert (entry["arg"], entry["required"], entry["default"], entry["min"]) == ("--marker-size", True, 0.25, 0.01)
-
-
-# -- what wheel-odometry logs where no hall sensors are published
-
-
-def test_without_samples_it_names_the_key_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    script = runpy.run_path(str(ROOT / "pebble/extensions/scripts/shipped/wheel-odometry/run.py"))
-    robot = Mock(config=parse({"robot": {"id": "goob"}}, folder=tmp_path, env={}), log=logging.getLogger("odometry"))
-    robot.sleep.side_effect = [None] * 9 + [Stopped(0)]
-    monkeypatch.setattr(time, "monotonic", itertools.count().__next__)
-    with pytest.raises(Stopped):
-        script["main"](robot, script["OdometrySettings"]())
-    assert caplog.text.count("services.serial_mcu_bridge.telemetry.publish_touch_sensors") == 1
