@@ -119,6 +119,25 @@ def test_an_expander_that_hung_publishes_nothing_that_is_old(start: Start) -> No
     assert expander.expander.counts["late groups"] > 0
 
 
+def test_of_two_expanders_the_smaller_id_works_and_no_value_comes_twice(start: Start) -> None:
+    world = start()
+    second = Beside(world, "7")
+    number = run(world, 4, second)
+    first = Beside(world, "3")
+    number = run(world, 6, second, first, first=number)
+    works = second.expander.counts["groups"]
+    number = run(world, 4, second, first, first=number)
+    assert second.expander.counts["groups"] == works, "one is silent"
+    first.close()
+    number = run(world, 6, second, first=number)
+    world.remote.seen.clear()
+    run(world, 4, second, first=number)
+    assert counted(world, TOUCH) >= 3, "the other one has taken over"
+    assert second.expander.counts["groups"] > works
+    values = world.remote.payloads(TOUCH)
+    assert len(values) == len(set(values))
+
+
 def test_heartbeats_states_and_stops_are_never_in_a_group(start: Start) -> None:
     world = start()
     expander = Beside(world)
@@ -179,6 +198,15 @@ def test_what_is_packed_is_unpacked() -> None:
     assert unpacked(packed(text, 5, b""), {}) == streams
     assert unpacked(packed(text, 5, text), {5: text}) == streams
     assert len(packed(text, 5, text)) < len(zlib.compress(text)) < len(text) + 12
+
+
+def test_the_wire_says_how_often_and_has_the_dictionary(start: Start) -> None:
+    world = start()
+    wire = msgspec.json.decode(world.retained(WIRE)[1] or b"")
+    assert wire == {"group_hz": 2.0}
+    run(world, 8, Beside(world))
+    wire = msgspec.json.decode(world.retained(WIRE)[1] or b"")
+    assert msgspec.json.decode(wire["dict"]).keys() == {"touch-sensors", "wheel-odometry"}
 
 
 @pytest.mark.parametrize("claimed", [False, True], ids=["its own", "another robot's, too"])
