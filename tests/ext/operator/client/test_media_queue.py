@@ -193,6 +193,15 @@ def test_over_a_thin_connection_small_pictures_come_from_the_rescue_stream() -> 
     assert not offered(viewer, 3, now + 61)
 
 
+def test_small_pictures_that_are_late_as_well_do_not_put_off_the_return() -> None:
+    viewer = ViewerQueue(ALL, 0.0)
+    for seq in range(18):
+        show(viewer, seq, seq / 2, seq / 2 + 0.5)
+        assess([viewer], "pbvd", seq / 2 + 0.5, can_rescue=True)
+        assert viewer.rescued == (seq > 0)
+    assert not offered(viewer, 18, 61.0)
+
+
 # -- the encoding
 
 OFFERED, BOTH, PCM = ("json", "pbvd", "h264"), frozenset({"opus", "pcm"}), frozenset({"pcm"})
