@@ -2,47 +2,24 @@
 
 from __future__ import annotations
 
-import fcntl
-import logging
+import json
 import os
+import shutil
 import subprocess
 import sys
+import tempfile
+from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 
 import pytest
 
 from pebble.commands import app
 from pebble.extension import ours
-from tests.commands.command_line import Run, config_file, program
-from tests.support import ROOT, free_port, some, until
+from tests.commands.command_line import Run, config_file
+from tests.support import ROOT, cases, free_port, some, until
 
 NAMES = [tuple(words.split()) for words in app.commands(["up"])]
-TOPIC = [("topic", name) for name in ("list", "echo", "pub", "hz", "contract", "expand")]
-
-
-def test_a_command_leaves_logging_as_it_was(run: Run) -> None:
-    before = list(logging.getLogger("pebble").handlers)
-    assert run("--version") == 0
-    assert run("nonsense") == 2
-    assert logging.getLogger("pebble").handlers == before
-
-
-def test_the_package_runs_as_the_command_does() -> None:
-    package, command = (
-        subprocess.run(
-            [sys.executable, "-m", module, "nonsense"], cwd=ROOT, capture_output=True, text=True, check=False
-        )
-        for module in ("pebble", "pebble.cli")
-    )
-    assert (package.returncode, package.stdout, package.stderr) == (command.returncode, command.stdout, command.stderr)
-
-
-@pytest.mark.parametrize("command", NAMES + TOPIC)
-def test_every_command_explains_itself_with_an_example(run: Run, command: tuple[str, ...]) -> None:
-    assert run(*command, "--help") == 0
-    assert f"\n      pebble {command[0]}" in run.out
-    assert max(map(len, run.out.splitlines())) <= 80
-    assert run.err == ""
 
 
 @pytest.mark.parametrize("arguments", [(), ("--help",)])
@@ -53,13 +30,6 @@ def test_all_commands_are_listed_on_one_screen(run: Run, arguments: tuple[str, .
     assert [line.split()[0] for line in lines if line[0] != " "] == ["use", "own", "write", "share", "measure"]
     assert len(lines) <= 24, "a screen of 24 lines shows all but the usage"
     assert max(map(len, (usage, *lines))) <= 80
-
-
-@pytest.mark.parametrize("group", ["topic", "fleet", "web user"])
-def test_a_group_without_a_command_lists_those_below_it(run: Run, group: str) -> None:
-    assert run(*group.split()) == 0
-    assert "Commands:" in run.out
-    assert max(map(len, run.out.splitlines())) <= 80
 
 
 @pytest.mark.parametrize(("former", "now"), [row for one in ours() for row in one.former.items()])
@@ -86,32 +56,15 @@ def test_a_command_imports_no_other() -> None:
     [
         (("flyy",), "flyy", "pebble --help"),
         (("up",), "CONFIG", "pebble up --help"),
-        (("topic", "contract", "--bad"), "--bad", "pebble topic contract --help"),
         (("sim", "bob"), "bob", "pebble sim --help"),
         (("sim", "minilamp"), "--broker URL", "pebble sim --help"),
-        (("sim", "goob", "--robots", "2"), "goob takes no --robots", "pebble sim --help"),
-        (("sim", "goob", "spot"), "goob takes no spot", "pebble sim --help"),
-        (("sim", "world", "--lnk", "/tmp"), "--lnk", "pebble sim --help"),
-        (("doctor", "--running"), "which robot", "pebble doctor --help"),
         (("doctor", "--running", "--report", "a.zip"), "--running or --report", "pebble doctor --help"),
-        (("doctor", "goob.json", "--may-move"), "--may-move is for --running", "pebble doctor --help"),
         (("watch", "goob.json"), "--picture", "pebble watch --help"),
-        (("topic", "pub", "drive-values"), "PAYLOAD", "pebble topic pub --help"),
-        (("topic", "pub", "drive-values", "{}", "--qos", "2"), "qos", "pebble topic pub --help"),
         (("up", "/nowhere/goob.json"), "/nowhere/goob.json", ""),
-        (("doctor", "/nowhere/goob.json"), "/nowhere/goob.json", ""),
         (("topic", "list"), "--config CONFIG or --url URL", ""),
-        (("topic", "list", "--config", "a", "--url", "b"), "--config CONFIG or --url URL", ""),
-        (("topic", "list", "--url", "http://x"), "mqtt://HOST", ""),
         (("topic", "list", "--url", "mqtt://127.0.0.1", "--remote"), "--remote", ""),
         (("topic", "echo", "online", "--url", "mqtt://127.0.0.1", "--robot", "a/b"), "--robot a/b", ""),
-        (
-            ("topic", "list", "--url", "mqtt://127.0.0.1", "--password-file", "/nowhere/p"),
-            "--password-file: No such file",
-            "",
-        ),
         (("topic", "list", "--url", "mqtt://127.0.0.1:1"), "127.0.0.1:1", ""),
-        (("topic", "contract", "--base", "a/b"), "a/b", ""),
     ],
 )
 def test_what_is_wrong_is_one_line_and_exit_code_1_or_for_a_command_line_2(
@@ -142,7 +95,7 @@ def test_up_refuses_a_robot_that_runs_on_its_own_mcu(run: Run, tmp_path: Path) -
     assert "runs on its own MCU" in run.err
 
 
-@pytest.mark.parametrize("closed", some(["<&- >&- 2>&-", "<&- 2>&-", ">&-"], 3))
+@pytest.mark.parametrize("closed", some(["<&- >&- 2>&-", ">&-"], 2))
 def test_a_robot_runs_without_standard_streams(tmp_path: Path, closed: str) -> None:
     config = config_file(
         tmp_path, transport={"kind": "mqtt", "run_dir": str(tmp_path / "run")}, local_mqtt={"port": free_port()}
@@ -155,22 +108,72 @@ def test_a_robot_runs_without_standard_streams(tmp_path: Path, closed: str) -> N
         assert robot.wait(20) == 0
 
 
-def test_a_reader_that_goes_away_is_no_error() -> None:
-    read, write = os.pipe()
-    fcntl.fcntl(write, fcntl.F_SETPIPE_SZ, 4096)
-    # Unbuffered, Python itself would lose what a broken pipe did not accept, without an error.
-    env = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
-    process = program("topic", "contract", "--json", stdout=write, env=env)
-    os.close(write)
-    assert os.read(read, 1) == b"["
-    os.close(read)
-    assert process.communicate(timeout=60)[1] == ""
-    assert process.returncode == 1
-
-
 def test_a_command_whose_package_is_missing_says_what_to_install() -> None:
     code = "import sys; sys.modules['cv2'] = None; sys.argv = ['pebble', 'demo'];"
     code += "from pebble import cli; sys.exit(cli.main())"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     needs = 'pebble: demo needs the package cv2, which is not installed: pip install "pebble-robot[all]"\n'
     assert (done.returncode, done.stderr) == (1, needs)
+
+
+# -- what a command's environment may lack: a home, a name for the user, an encoding, an output
+
+
+_PATH = {"PATH": os.defpath}
+_NO_USER = ("setpriv", "--reuid=12345", "--regid=12345", "--clear-groups")
+changes_users = pytest.mark.skipif(
+    os.getuid() != 0 or subprocess.run([*_NO_USER, sys.executable, "-c", ""], capture_output=True).returncode != 0,
+    reason="needs root, and a Python that other users may run",
+)
+
+#: Words before the command, the environment, and what the command says instead of ending with a traceback.
+ENVIRONMENTS = [
+    pytest.param(_NO_USER, {}, "~/.local/state: the home folder is not known; set HOME", marks=changes_users),
+    pytest.param(_NO_USER, {"HOME": "/nonexistent"}, "", marks=changes_users),
+    ((), {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}, "pebble/robots/gö🤖b"),
+    ((), {"PYTHONIOENCODING": "ascii"}, "pebble/robots/g\\xf6\\U0001f916b"),
+    ((), {"LC_ALL": "xx_YY.UTF-8"}, "pebble/robots/gö🤖b"),
+    ((), {"HOME": "/", "TMPDIR": "/nonexistent", "PATH": ""}, "pebble/robots/gö🤖b"),
+]
+COMMANDS = [["check"], ["check", "--json"]]
+
+
+@pytest.fixture
+def config() -> Iterator[Path]:
+    """A copy in a folder that every user may read."""
+    folder = Path(tempfile.mkdtemp())
+    folder.chmod(0o755)
+    path = folder / "robot.json"
+    services = {"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "127.0.0.1", "port": 1}}}
+    path.write_text(json.dumps({"robot": {"id": "gö🤖b"}, "transport": {"kind": "zenoh"}, "services": services}))
+    yield path
+    shutil.rmtree(folder)
+
+
+@pytest.mark.parametrize(("before", "environment", "printed"), ENVIRONMENTS)
+def test_a_command_runs_or_names_what_is_missing(
+    config: Path, before: tuple[str, ...], environment: dict[str, str], printed: str
+) -> None:
+    for words in COMMANDS[: 1 if printed.startswith("~") else cases(1, 2)]:
+        command = [*before, sys.executable, "-m", "pebble.cli", *words, str(config)]
+        env = {**_PATH, "HOME": str(config.parent), **environment, "PYTHONPATH": str(ROOT)}
+        if printed.startswith("~"):
+            del env["HOME"]
+        done = subprocess.run(command, env=env, cwd="/", capture_output=True, timeout=60)
+        text = (done.stdout + done.stderr).decode(errors="replace")
+        assert "Traceback" not in text
+        assert "Error" not in text
+        assert done.returncode == int(printed.startswith("~")), text
+        assert printed in text or words != ["check"], text
+
+
+OUTPUTS = [">/dev/full", "2>/dev/full", ">/dev/full 2>&1", "| true"]
+
+
+@pytest.mark.parametrize(("words", "outputs"), some(product([COMMANDS[0], ["--help"], ["nonsense"]], OUTPUTS), 5))
+def test_an_output_that_is_full_or_gone_ends_a_command_in_order(config: Path, words: list[str], outputs: str) -> None:
+    command = [sys.executable, "-m", "pebble.cli", *words, *([str(config)] if words in COMMANDS else [])]
+    done = subprocess.run(["sh", "-c", f'"$@" {outputs}', "sh", *command], cwd=ROOT, capture_output=True, timeout=60)
+    assert done.returncode in (0, 1, 2)
+    assert b"Traceback" not in done.stderr
+    assert b"Exception ignored" not in done.stderr

@@ -131,12 +131,16 @@ def test_a_stop_latches_the_robot_and_only_a_reset_frees_it(scene: Scene) -> Non
     scene.drives()
 
 
-def test_it_releases_control_at_its_end(scene: Scene) -> None:
+@pytest.mark.parametrize("scene", OPERATORS, indirect=True)
+def test_at_its_end_it_sends_a_zero_and_releases_control(scene: Scene) -> None:
     scene.drives()
+    scene.seen.look(0.8)  # it is about to ask again
     assert scene.operator.stdin is not None
     scene.operator.stdin.close()
     assert scene.seen.wait(lambda: scene.key() == "", SOON_S)
     assert scene.operator.wait(10) == 0
+    asked = [record.value.want for record in scene.seen.of(c.CONTROL) if record.value is not None]
+    assert (asked[-1], scene.commands()[-1].moves) == ("release", False)
 
 
 def test_a_robot_that_is_gone_is_not_driven_on(scene: Scene) -> None:

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import json
+import math
 import os
+import runpy
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 from queue import SimpleQueue
 
+import pytest
+
 from examples.transport import Datagrams
+from pebble.extensions.scripts.perception.odom_follow import Pose
+from pebble.extensions.scripts.perception.tags import Place
 from pebble.transports import Message, MqttSettings, create
-from tests.ext.recordings.playing import Line, write
+from tests.ext.recordings.playing import Line, js, write
 from tests.support import ROOT, Broker, Child, free_port, until
 
 GOOB = "pebble/robots/goob"
-ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
+ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
 
 
 def example(name: str, *arguments: object) -> list[str]:
@@ -81,3 +87,58 @@ def test_the_transport_carries_messages_between_two_clients() -> None:
         assert robot.publish(f"{GOOB}/outgoing/online", b"{}")
         message = received.get(timeout=10)
         assert (message.topic, message.payload) == (f"{GOOB}/outgoing/online", b"{}")
+
+
+# -- for ROS 2, with packages that `make test` does not install: cyclonedds, mcap-ros2-support
+
+
+def test_a_twist_drives_the_robot(broker: Broker) -> None:
+    domain, pub, topic = (pytest.importorskip(f"cyclonedds.{name}") for name in ("domain", "pub", "topic"))
+    program = ROOT / "examples" / "ros2_cmd_vel.py"
+    kinds = runpy.run_path(str(program))
+    node = domain.DomainParticipant()
+    writer = pub.DataWriter(node, topic.Topic(node, "rt/cmd_vel", kinds["Twist"]))
+    twist = kinds["Twist"](kinds["Vector3"](0.25, 0.0, 0.0), kinds["Vector3"](0.0, 0.0, -1.0))
+    received: list[Message] = []
+    with create("mqtt", "robot", MqttSettings(host="127.0.0.1", port=broker.port)) as robot:
+        robot.subscribe("pebble/robots/goob/incoming/drive-values", received.append)
+        command = [sys.executable, str(program), "127.0.0.1", str(broker.port), "goob"]
+        with Child(command, env=ENVIRONMENT) as child:
+            assert until(lambda: writer.write(twist) or received, 30)
+            child.kill()
+    assert json.loads(received[0].payload) == {"x": 0.5, "z": 0.5, "valid_ms": 500}
+
+
+def test_odometry_is_a_bag_of_ros_2(tmp_path: Path) -> None:
+    reader = pytest.importorskip("mcap_ros2.reader")
+    topic = "pebble/robots/goob/outgoing/wheel-odometry"
+    value = {"x_mm": 250, "y_mm": 0, "heading_rad": 1.5}
+    recording, bag = write(tmp_path / "a.mcap", [Line(0, topic, js(value=value))]), tmp_path / "bag.mcap"
+    command = [sys.executable, str(ROOT / "examples" / "ros2_bag.py"), str(recording), str(bag)]
+    subprocess.run(command, env=ENVIRONMENT, check=True)
+    (message,) = reader.read_ros2_messages(bag)
+    assert (message.channel.topic, message.ros_msg.x, message.ros_msg.theta) == ("/goob/pose", 0.25, 1.5)
+
+
+# -- where another robot is, by the odometry of both
+
+
+AT_0 = Pose(0.0, 0.0, 0.0)
+AHEAD, HALF, QUARTER = Pose(0.4, 0.0, 0.0), Pose(0.2, 0.0, 0.0), math.pi / 2
+
+#: Poses of this robot and of the other one, from the first call on, and where it is at last: metres ahead and left.
+WAYS: dict[str, tuple[list[tuple[Pose, Pose]], tuple[float, float]]] = {
+    "both stand": ([(AT_0, AT_0), (AT_0, AT_0)], (0.6, 0.0)),
+    "this one follows": ([(AT_0, AT_0), (AT_0, AHEAD), (AHEAD, AHEAD)], (0.6, 0.0)),
+    "this one turns left": ([(AT_0, AT_0), (Pose(0, 0, QUARTER), AT_0)], (0.0, -0.6)),
+    "its odometry begins anew": ([(AT_0, Pose(5, 0, 0)), (AT_0, Pose(5.2, 0, 0)), (AT_0, AT_0)], (0.8, 0.0)),
+    "and goes on": ([(AT_0, Pose(5, 0, 0)), (AT_0, AT_0), (AT_0, HALF)], (0.8, 0.0)),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_it_is_known_where_it_is(way: str) -> None:
+    poses, (ahead, left) = WAYS[way]
+    companion = runpy.run_path(str(ROOT / "examples" / "follow-a-robot" / "run.py"))["Companion"](0.6, 0.0)
+    place = [companion.place(mine, its) for mine, its in poses][-1]
+    assert place == pytest.approx(Place(math.hypot(ahead, left), -math.atan2(left, ahead)))

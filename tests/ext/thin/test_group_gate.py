@@ -6,21 +6,16 @@ from typing import Any
 import msgspec
 import pytest
 
-from pebble.contract import groups
-from pebble.errors import ConfigError
-from pebble.forwarding.forwarder import Forwarder
-from pebble.forwarding.routing import Drop, Forward
+from pebble.contract import DRIVE as DRIVE_CHANNEL
+from pebble.contract import LIGHTS_SOLID, MCU_COMMAND, OUTLET_COMMAND, codec, groups
+from pebble.errors import ConfigError, PayloadError
+from pebble.extensions.thin.group_gate import copy_of, is_marked
 from pebble.launcher.capabilities import capabilities
 from pebble.runtime.addresses import Addresses
 from tests.forwarding.virtual import World
 from tests.services.mqtt_bridge.bridge_rig import make_config
 
-GROUP, DRIVE, LIGHTS, SOUND = (
-    "incoming/group",
-    "incoming/drive-values",
-    "incoming/lights-solid",
-    "incoming/soundboard-command",
-)
+GROUP, DRIVE, SOUND = "incoming/group", "incoming/drive-values", "incoming/soundboard-command"
 BOTH = b'{"drive-values": {"z": 0.5}, "lights-solid": {"r": 1}}'
 ZERO = b'{"drive-values": {"z": 0}, "lights-solid": {"r": 1}}'
 SIGNED = b'{"drive-values": {"z": 0.5, "source": "autonomy", "run": 3}, "lights-solid": {"r": 1}}'
@@ -63,19 +58,6 @@ def test_a_group_passes_whole_and_then_as_copies(start: Start, profile: str) -> 
     assert arrived(world) == [("group", {"drive-values": {"z": 0.5}, "lights-solid": {"r": 1}}), *COPIES]
 
 
-def test_a_bridge_that_ends_behind_the_group_leaves_it_whole(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
-    world, deliver = start(), Forwarder.deliver
-
-    def deliver_once(*arguments: Any) -> Forward | Drop:
-        monkeypatch.setattr(Forwarder, "deliver", lambda *_: Drop.NO_ROOM)
-        return deliver(*arguments)
-
-    monkeypatch.setattr(Forwarder, "deliver", deliver_once)
-    world.remote.publish(GROUP, BOTH)
-    world.run(0.1)
-    assert arrived(world) == [("group", {"drive-values": {"z": 0.5}, "lights-solid": {"r": 1}})]
-
-
 def test_without_the_key_a_group_is_a_command_like_any_unknown_one(start: Start) -> None:
     world = start(on=False)
     world.remote.publish(GROUP, BOTH)
@@ -86,7 +68,6 @@ def test_without_the_key_a_group_is_a_command_like_any_unknown_one(start: Start)
 @pytest.mark.parametrize(
     ("payload", "late_s", "passes"),
     [
-        (b'{"drive-values": {"z": 0.5}, "estop": {}}', 0.0, []),
         (b'{"drive-values": {"z": 0.1}, "\\u0064rive-values": {"z": 0.9}}', 0.0, []),
         (BOTH, 0.6, []),
         (ZERO, 0.6, ["group", "drive-values", "lights-solid"]),
@@ -115,20 +96,10 @@ def test_a_scripts_zero_passes_as_a_persons(start: Start) -> None:
     assert len(arrived(world)) == 3
 
 
-def test_a_retained_group_is_stale(start: Start) -> None:
-    world = start()
-    world.remote.publish(GROUP, BOTH, retain=True)
-    world.run(0.1)
-    assert arrived(world) == []
-    assert world.service.status.counts[f"remote: {Drop.STALE.value}"] == 1
-
-
 @pytest.mark.parametrize(
     ("suffix", "payload", "passes"),
     [
         (DRIVE, b'{"z": 0.5, "group": true}', False),
-        (DRIVE, b'{"z": 0.5, "gr\\u006fup": true}', False),
-        (LIGHTS, b'{"r": 1, "group": true}', False),
         (DRIVE, b'{"z": 0, "group": true}', True),
         (DRIVE, b'{"z": 0.5}', True),
         (SOUND, b'{"action": "stop", "group": true}', True),
@@ -141,13 +112,6 @@ def test_marked_copies_from_outside_are_refused_but_no_zero(
     world.remote.publish(suffix, payload)
     world.run(0.1)
     assert world.local.payloads(suffix) == ([payload] if passes else [])
-
-
-def test_members_go_to_renamed_topics(start: Start) -> None:
-    world = start(serial={"topics": {"drive_values": "pebble/robots/rover/incoming/wheels"}})
-    world.remote.publish(GROUP, BOTH)
-    world.run(0.1)
-    assert [metric for metric, _ in arrived(world)] == ["group", "wheels", "lights-solid"]
 
 
 def test_a_dated_group_tells_its_age(start: Start) -> None:
@@ -171,13 +135,7 @@ def test_lines_whose_wheels_have_other_topics_exclude_groups() -> None:
 @pytest.mark.parametrize(
     ("serial", "on", "listed"),
     [
-        (
-            {"instances": {"arm": {"enabled": True, "protocol": "pebble_serial_v1", "serial": {"port": "/dev/b"}}}},
-            True,
-            ["mcu/{uid}/{name}"],
-        ),
         ({"enabled": True, "serial": {"port": "/dev/a"}}, True, ["drive-values", "lights-solid", "lights-flash"]),
-        ({}, True, []),
         ({"enabled": True, "serial": {"port": "/dev/a"}}, False, None),
     ],
 )
@@ -186,9 +144,68 @@ def test_capabilities_list_what_a_robot_takes_in_a_group(serial: dict[str, Any],
     assert capabilities(config, Addresses(config)).get("groups") == listed
 
 
-def test_what_may_be_in_a_group_is_a_table() -> None:
-    """A member that is added must also be one that a driver may send by itself: pebble/extensions/fleet/roles.py."""
-    assert {channel.metric for channel in groups.MEMBERS} == {
-        "drive-values", "lights-solid", "lights-flash", "soundboard-command", "outlets/{outlet}/power",
-        "mcu/{uid}/{name}",
-    }  # fmt: skip
+# -- what may be in one, and what its copies are
+
+ALL_MEMBERS = (
+    b'{"drive-values": {"x": -0.25, "z": 0.5, "valid_ms": 400}, "lights-solid": {"r": 0.5},'
+    b' "outlets/lamp/power": {"on": true}, "mcu/abc/arm": {"angle": 3}, "soundboard-command": {"action": "stop"}}'
+)
+
+
+def test_members_have_their_values() -> None:
+    members = {member.metric: member for member in groups.decode(ALL_MEMBERS)}
+    assert members["drive-values"].value == codec.decode(DRIVE_CHANNEL, b'{"x": -0.25, "z": 0.5, "valid_ms": 400}')
+    assert members["lights-solid"].channel is LIGHTS_SOLID
+    assert members["outlets/lamp/power"].channel is OUTLET_COMMAND
+    assert members["mcu/abc/arm"].channel is MCU_COMMAND
+    assert [metric for metric, member in members.items() if member.channel.ends(member.value)] == ["soundboard-command"]
+
+
+def test_copies_are_marked_where_the_owner_of_a_line_takes_the_group() -> None:
+    copies = {member.metric: copy_of(member) for member in groups.decode(ALL_MEMBERS)}
+    marked = {metric for metric, copy in copies.items() if is_marked(copy)}
+    assert marked == {"drive-values", "lights-solid", "mcu/abc/arm"}
+    assert copies["outlets/lamp/power"] == b'{"on":true}'
+
+
+def test_the_sender_is_in_each_member_and_no_claim() -> None:
+    raw = b'{"by": "otto", "drive-values": {"z": 1, "by": "eve", "group": true}, "lights-solid": {}}'
+    assert [member.payload for member in groups.decode(raw)] == [b'{"z":1,"by":"otto"}', b'{"by":"otto"}']
+
+
+@pytest.mark.parametrize(
+    "raw",
+    [
+        b'{"drive-values": {"z": 0.1}, "\\u0064rive-values": {"z": 0.9}, "lights-solid": {"r": 1}}',
+        b'{"drive-values": {"z": 0.1, "\\u007a": 0.9}}',
+        b'{"drive-values": {"z": 0.5}, "estop": {}}',
+        b'{"drive-values": {"z": 0.5}, "control/take": {"id": "0badf00d"}}',
+        b'{"drive-values": {"z": 0.5}, "mcu/a/b/c": {}}',
+        b'{"drive-values": {"z": 0.5}, "outlets/1/power": {"on": 1}}',
+        b'{"drive-values": {"z": 0.5, "valid_ms": 0}, "lights-solid": {"r": 1}}',
+        b'{"drive-values": {"z": 0.5, "source": "autonomy"}}',
+        b'{"drive-values": {"x": NaN}, "lights-solid": {"r": 1}}',
+        b'{"lights-solid": {"r": 1}, "lights-flash": {"r": 1}}',
+        b"{}",
+        b"",
+        b'{"drive-values":' + b"[" * 500 + b"]" * 500 + b"}",
+        b'{"lights-solid": {"r": 1' + b" " * 2048 + b"}}",
+        b"{" + b", ".join(b'"outlets/%d/power": {"on": true}' % number for number in range(9)) + b"}",
+    ],
+)  # fmt: skip
+def test_a_group_with_a_bad_member_is_refused(raw: bytes) -> None:
+    with pytest.raises(PayloadError):
+        groups.decode(raw)
+
+
+@pytest.mark.parametrize(
+    ("raw", "marked"),
+    [
+        (b'{"z": 1, "group": true}', True),
+        (b'{"z": 1, "gr\\u006fup": true}', True),
+        (b'{"value": {"z": 1, "group": true}}', True),
+        (b'{"group": ', False),
+    ],
+)
+def test_marks_are_found_however_they_are_written(raw: bytes, marked: bool) -> None:
+    assert is_marked(raw) is marked

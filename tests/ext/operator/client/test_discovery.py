@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 
 from pebble import contract as c
-from pebble.contract import CAPABILITIES, ESTOP_STATE, LINK
+from pebble.contract import CAPABILITIES, DRIVE, ESTOP_STATE, LINK
+from pebble.extensions.operator.client.announced import announced
 from pebble.extensions.operator.client.discovery import Discovery
 from pebble.extensions.operator.client.robot_view import MAX_REMEMBERED, RobotView
 from pebble.transports import Message
@@ -91,7 +92,6 @@ def test_topics_of_another_robot_in_capabilities_are_not_used() -> None:
     ("drive", "drives", "arbitrates"),
     [
         ({}, False, False),
-        ({"available": True}, True, False),
         ({"available": True, "controls": False}, False, False),
         ({"available": True, "controls": True, "arbitrates": True}, True, True),
         ({"available": "yes", "arbitrates": "yes"}, False, False),
@@ -113,3 +113,49 @@ def test_only_what_a_robot_offers_is_assumed_of_it(drive: dict[str, object], dri
     assert robot.online(2.1) is False, "people are told after 1.5 s"
     publish(discovery, "online", {"t": int(WALL * 1000), "online": False}, now=0.6)
     assert robot.liveness.online(0.6) is False, "a will"
+
+
+# -- a robot in another language without capabilities: what it subscribes to is what it offers
+
+
+LIST = ["incoming/drive-values", "incoming/lights-solid"]
+
+
+def payload(**fields: Any) -> bytes:
+    return json.dumps({"t": 1710969600000, **fields}).encode()
+
+
+@pytest.mark.parametrize("made", [payload(subscribes=LIST), payload(value={"subscribes": LIST})], ids=["bare", "value"])
+def test_what_it_subscribes_to_is_what_it_offers(made: bytes) -> None:
+    value = announced(BASE, made)
+    assert value["drive"] == {"available": True, "controls": True, "topic": f"{BASE}/incoming/drive-values"}
+    assert value["lights"] == {"solid": True, "flash": False}
+    assert not value["video"]["available"]
+    assert "estop" not in value
+    assert value["announced"] is True
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        payload(subscribes=[1, None, "drive-values", "pebble/robots/other/incoming/drive-values"]),
+        payload(subscribes=[*LIST, "x" * 5000]),
+        b'{"subscribes": [',
+    ],
+)
+def test_all_else_announces_nothing(made: bytes) -> None:
+    assert announced(BASE, made) == {}
+
+
+@pytest.mark.parametrize(("channel", "key"), [(c.ONLINE, "subscribes"), (c.STATUS, "value")])
+def test_it_is_driven_until_it_publishes_capabilities(channel: c.Channel, key: str) -> None:
+    robot = RobotView(BASE)
+    made = payload(**{key: LIST if key == "subscribes" else {"subscribes": LIST}})
+    robot.receive(channel, Message(channel.topic(BASE), made), now=1.0, wall=1710969600.0)
+    assert robot.drives
+    assert robot.topic(DRIVE) == f"{BASE}/incoming/drive-values"
+    assert not robot.estop.has_capabilities
+    capable = Message(c.CAPABILITIES.topic(BASE), payload(value={"drive": {"available": False}}))
+    robot.receive(c.CAPABILITIES, capable, now=1.1, wall=1710969600.1)
+    robot.receive(channel, Message(channel.topic(BASE), made), now=1.2, wall=1710969600.2)
+    assert not robot.drives

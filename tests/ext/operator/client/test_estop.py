@@ -49,12 +49,6 @@ def test_the_first_stop_needs_nothing_from_the_robot() -> None:
     assert (stop.tick(0.1), stop.due) == ([], 0.5)
 
 
-def test_a_name_is_new_for_every_stop_and_valid() -> None:
-    assert new_name() != new_name()
-    with pytest.raises(ValueError, match="16 hex digits"):
-        StopSender("now", by="", why="", now=0.0, robots=[GOOB])
-
-
 def test_it_is_confirmed_by_every_owner_and_then_silent() -> None:
     stop, robot = sender(GOOB), Robot(GOOB, "left", "right")
     receive(stop, robot.capabilities(), now=0.01)
@@ -84,11 +78,10 @@ def test_the_retained_state_of_an_earlier_stop_confirms_nothing() -> None:
     assert sent_times(stop, 2.0) == [0.1, 0.6, 1.1, 1.6]
 
 
-@pytest.mark.parametrize(("persisted", "confirmed", "saved"), [(True, True, True), (None, True, False)])
-def test_an_owner_that_cannot_save_confirms_all_the_same(persisted: bool | None, confirmed: bool, saved: bool) -> None:
-    stop, robot = sender(GOOB), Robot(GOOB, "mcu", persisted=persisted)
+def test_an_owner_that_cannot_save_confirms_all_the_same() -> None:
+    stop, robot = sender(GOOB), Robot(GOOB, "mcu", persisted=None)
     receive(stop, robot.capabilities(), *robot.take(stop.tick(0.0)), now=0.1)
-    assert (stop.confirmed, stop.robots[GOOB].saved) == (confirmed, saved)
+    assert (stop.confirmed, stop.robots[GOOB].saved, stop.finished) == (True, False, True)
 
 
 def test_it_goes_on_until_the_state_is_on_disk() -> None:
@@ -126,15 +119,7 @@ def test_a_robot_that_never_answers_is_given_up_after_a_minute() -> None:
     assert stop.robots[GOOB].why == "nothing was received: it may be off"
 
 
-def test_an_owner_that_never_answers_is_named() -> None:
-    stop, robot = sender(GOOB), Robot(GOOB, "left", "right")
-    receive(stop, robot.capabilities(), *robot.take(stop.tick(0.0))[:1], now=0.1)
-    sent_times(stop, 100.0)
-    assert stop.robots[GOOB].progress is Progress.NOT_CONFIRMED
-    assert stop.robots[GOOB].unconfirmed == {"right": "has not confirmed"}
-
-
-@pytest.mark.parametrize("owners", [[], None, ["a/b"], [1], ["x"] * 17, "serial"])
+@pytest.mark.parametrize("owners", [[], ["a/b"], ["x"] * 17, "serial"])
 def test_a_robot_without_valid_owners_is_never_confirmed(owners: object) -> None:
     stop, robot = sender(GOOB), Robot(GOOB, "serial", estop={"available": True, "owners": owners})
     receive(stop, robot.capabilities(), *robot.take(stop.tick(0.0)), now=0.1)
@@ -142,7 +127,7 @@ def test_a_robot_without_valid_owners_is_never_confirmed(owners: object) -> None
     assert not stop.confirmed
 
 
-@pytest.mark.parametrize("section", [{}, {"estop": {}}, {"estop": 5}])
+@pytest.mark.parametrize("section", [{}, {"estop": 5}])
 def test_an_old_robot_gets_zeros_and_one_end_of_its_script(section: dict[str, object]) -> None:
     stop = sender(GOOB)
     value = {"drive": {"available": True, "topic": "else/where"}, "autonomy": {"command_topic": "a/script"}, **section}
@@ -193,7 +178,7 @@ def test_capabilities_that_arrive_later_lead_to_the_right_topic_at_once() -> Non
     assert topics(stop.tick(0.05)) == [ESTOP, "else/where"]
 
 
-@pytest.mark.parametrize("topic", ["a/#", "$SYS/x", "", 5, "x" * 2000, "a\x1b[31m"])
+@pytest.mark.parametrize("topic", ["a/#", 5])
 def test_a_topic_that_cannot_be_published_to_is_not_used(topic: object) -> None:
     stop, robot = sender(GOOB), Robot(GOOB, "serial", drive={"topic": topic})
     receive(stop, robot.capabilities(), now=0.0)
@@ -220,12 +205,9 @@ def test_a_person_may_end_it() -> None:
 #: What may wrongly be taken for something that does not drive, and how often a stop of all is sent to it in 2 s.
 MOVERS: dict[str, tuple[Message, int]] = {
     "no capabilities": (outgoing(GOOB, "online", {"t": 1}), 4),
-    "a board of the original": (outgoing(GOOB, "online", {"t": 1, "subscribes": ["incoming/drive-values"]}), 4),
-    "another type": (outgoing("pebble/lamps/mini", "online", {"t": 1}), 4),
     "an unknown section": (capabilities(GOOB, {"arm": {"available": True}}), 4),
     "a drive section that is none": (capabilities(GOOB, {"drive": ["x"], "estop": 5}), 4),
     "capabilities that are none": (outgoing(GOOB, "capabilities", [1]), 4),
-    "driving without a stop": (capabilities(GOOB, {"drive": {"available": True}}), 4),
     "no driving, with a stop": (
         capabilities(GOOB, {"drive": {"available": False}, "estop": {"available": True, "owners": ["arm"]}}),
         4,
@@ -274,12 +256,6 @@ def test_all_robots_are_stopped_as_they_are_found_for_five_seconds() -> None:
     assert list(stop.robots) == [GOOB, FRED]
 
 
-def test_without_any_robot_it_ends_after_five_seconds_unconfirmed() -> None:
-    stop = sender()
-    stop.tick(5.0)
-    assert (stop.finished, stop.confirmed) == (True, False)
-
-
 def test_all_ends_when_all_are_confirmed_but_not_before_the_five_seconds() -> None:
     stop, robot = sender(), Robot(GOOB, "serial")
     receive(stop, robot.capabilities(), now=0.1)
@@ -314,8 +290,6 @@ def test_a_named_robot_is_never_spared() -> None:
         Message(f"{GOOB}/incoming/drive-values", b"{}"),
         Message(f"{GOOB}/outgoing/status", b"", retain=True),
         Message("pebble/servers/fair-1/outgoing/driving", b'{"t": 1, "robots": {}}'),
-        Message("a\x1bb/robots/goob/outgoing/online", b"{}"),
-        Message(f"{'x' * 65}/robots/goob/outgoing/online", b"{}"),
     ],
 )
 def test_what_no_robot_publishes_finds_none(message: Message) -> None:
@@ -324,7 +298,7 @@ def test_what_no_robot_publishes_finds_none(message: Message) -> None:
     assert stop.robots == {}
 
 
-HEARTBEAT, PICTURE = ("online", {"t": 1}), ("front-camera", "a picture")
+HEARTBEAT = ("online", {"t": 1})
 RETAINED = ("status", {})
 CAPABILITIES = (
     "capabilities",
@@ -332,16 +306,11 @@ CAPABILITIES = (
 )
 LATCH = Robot(GOOB, "serial").owners[0].latch
 STATE = ("estop/serial", LATCH.state(True))
-BAD_STATE = ("estop/serial", {"latched": "no"})
 
 #: What strangers publish for each of their components, and then the real robot.
 CROWDS = [
     ([HEARTBEAT], [HEARTBEAT]),
-    ([HEARTBEAT], [PICTURE]),
-    ([HEARTBEAT, BAD_STATE], [CAPABILITIES]),
-    ([RETAINED], [HEARTBEAT]),
     ([RETAINED], [RETAINED]),
-    ([CAPABILITIES, HEARTBEAT], [STATE]),
     ([STATE, CAPABILITIES, HEARTBEAT], [STATE, CAPABILITIES, HEARTBEAT]),
 ]
 
@@ -352,22 +321,16 @@ def publish(stop: StopSender, base: str, bodies: list[tuple[str, object]], now: 
     return stop.tick(now)
 
 
-@pytest.fixture(params=[30, pytest.param(MAX_ROBOTS, marks=pytest.mark.thorough)])
-def places(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> int:
-    """How many robots have a place."""
-    monkeypatch.setattr(estop, "MAX_ROBOTS", request.param)
-    return int(request.param)
-
-
 @pytest.mark.parametrize("hold", [False, True])
 @pytest.mark.parametrize(("theirs", "own"), CROWDS)
 def test_a_crowd_of_strangers_keeps_the_stop_from_no_robot(
-    places: int, theirs: list[tuple[str, object]], own: list[tuple[str, object]], *, hold: bool
+    monkeypatch: pytest.MonkeyPatch, theirs: list[tuple[str, object]], own: list[tuple[str, object]], *, hold: bool
 ) -> None:
-    stop, sent = sender(hold=hold), []
+    places, stop, sent = 30, sender(hold=hold), []
+    monkeypatch.setattr(estop, "MAX_ROBOTS", places)
     for step in range(20):
         now = 0.25 * step
-        for number in range(places + places // 5):
+        for number in range(places + 6):
             publish_quietly(stop, f"pebble/robots/r{number}", theirs, now)
         messages = stop.tick(now) + publish(stop, GOOB, own, now)
         sent += [now] * (ESTOP in topics(messages))
@@ -412,11 +375,6 @@ def test_robots_that_the_caller_knows_are_stopped_unheard_and_confirm_it_in_a_cr
     receive(stop, *robot.take(first[:1]), robot.capabilities(), now=0.3)
     assert stop.robots[GOOB].progress is Progress.CONFIRMED
     assert not stop.confirmed, "others are omitted"
-
-
-def test_named_robots_are_all_stopped_however_many() -> None:
-    bases = [f"pebble/robots/r{number}" for number in range(MAX_ROBOTS + 5)]
-    assert len(sender(*bases).tick(0.0)) == 2 * len(bases)
 
 
 def test_a_stop_that_is_refused_for_want_of_acknowledgements_is_sent_without_one() -> None:
@@ -469,42 +427,6 @@ def test_a_hold_stops_a_robot_again_that_has_lost_its_memory_and_no_other() -> N
     assert stop.robots[GOOB].confirmed_s == pytest.approx(0.6)
 
 
-def test_a_hold_is_not_disturbed_by_later_stops_of_others() -> None:
-    stop, robot = sender(GOOB, hold=True), Robot(GOOB, "serial")
-    receive(stop, robot.capabilities(), *robot.take(stop.tick(0.0)), now=0.1)
-    robot.owners[0].persisted = False
-    receive(stop, *robot.take(sender(GOOB).tick(0.0)), now=1.0)
-    assert (stop.confirmed, stop.tick(1.0)) == (True, [])
-
-
-def test_more_holds_than_an_owner_remembers_names_come_to_rest() -> None:
-    """Else each would take the place of another for ever, and a robot that is reset on purpose would not stay free."""
-    stops, robot = [sender(GOOB, hold=True) for _ in range(9)], Robot(GOOB, "serial")
-    for now in range(10):
-        for stop in stops:
-            states = robot.take(stop.tick(float(now)))
-            for other in stops:
-                receive(other, robot.capabilities(), *states, now=float(now))
-    assert all(stop.confirmed for stop in stops)
-    latch = robot.owners[0].latch
-    assert latch.count == 9
-    assert latch.reset(latch.boot, latch.count, 0, 0)
-    for stop in stops:
-        receive(stop, robot.owners[0].state(), now=20.0)
-    assert [stop.tick(20.0) for stop in stops] == [[]] * 9
-
-
-def test_it_is_confirmed_while_another_account_floods_the_robot_with_stops() -> None:
-    """A state comes four times a second, and thousands of other stops between two of them."""
-    stop, robot = sender(GOOB, by="mia"), Robot(GOOB, "serial")
-    receive(stop, robot.capabilities(), now=0.0)
-    robot.take(stop.tick(0.0))
-    for _ in range(2000):
-        robot.take(sender(GOOB, by="vera").tick(0.0))
-    receive(stop, robot.owners[0].state(), now=0.25)
-    assert (stop.confirmed, stop.tick(0.5)) == (True, [])
-
-
 def test_states_that_change_quickly_do_not_make_it_send_more_often() -> None:
     stop, robot = sender(GOOB, hold=True), Robot(GOOB, "serial")
     robot.owners[0].latch.boot = "ffffffff"
@@ -528,15 +450,3 @@ def test_a_removed_value_is_no_sign_of_life() -> None:
         assert stop.robots[GOOB].is_gone
     receive(stop, Message(f"{GOOB}/outgoing/online", b'{"t": 2}'), now=0.3)
     assert not stop.robots[GOOB].is_gone
-
-
-# -- what goes out
-
-
-def test_who_and_why_are_cut_and_made_harmless() -> None:
-    stop = sender(GOOB, by="ann\x1b[31m@" + "d" * 50, why='say "stop" ' + "é" * 50)
-    body = json.loads(stop.tick(0.0)[0].payload)
-    assert (len(body["by"]), len(body["why"])) == (32, 40)
-    assert body["by"].startswith("ann?[31m@d")
-    assert body["why"].startswith("say ?stop? ?")
-    assert len(stop.tick(0.5)[0].payload) < 128

@@ -2,15 +2,9 @@
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
-
 import pytest
 
 from pebble.contract import STATUS
-from pebble.extensions.operator.client.broker import Broker
-from pebble.extensions.operator.client.media_request import shared
 from pebble.extensions.operator.client.media_request.shared import SharedRequest
 from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.transports import Message
@@ -32,7 +26,6 @@ class Requested:
         self.robot.mute = True
         self.broker = broker_on(self.robot.hub)
         self.received: list[bytes] = []
-        self.steps = 0
         self.view = RobotView(REF)
         self.view.capabilities = {"video": VIDEO}
         self.request = SharedRequest(self.broker, REF, "video", self.received.append)
@@ -41,37 +34,7 @@ class Requested:
         self.view.receive(STATUS, Message(STATUS.topic(REF), status_of(camera)), 0.0, 0.0)
 
     async def step(self) -> None:
-        self.steps += 1
         await self.request.follow(self.view, "json")
-
-    @asynccontextmanager
-    async def running(self) -> AsyncIterator[None]:
-        await self.broker.open()
-        self.request.want(True)
-        task = asyncio.create_task(self.request.run(self.step))
-        try:
-            await until(lambda: self.robot.requests)
-            yield
-        finally:
-            self.request.close()
-            await task
-            await self.broker.close()
-            self.robot.close()
-
-
-async def test_it_is_withdrawn_once_there_is_a_broker_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shared, "LINGER_S", 0.0)
-    there = [True]
-    monkeypatch.setattr(Broker, "connected", property(lambda _: there[0]))
-    one = Requested()
-    async with one.running():
-        there[0] = False
-        one.request.want(False)
-        seen = one.steps
-        await until(lambda: one.steps > seen + 1)
-        assert one.robot.encodings == ["json"]
-        there[0] = True
-        await until(lambda: one.robot.encodings == ["json", None])
 
 
 async def test_nothing_is_asked_of_a_robot_that_waits() -> None:

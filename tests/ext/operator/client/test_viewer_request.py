@@ -47,8 +47,6 @@ def sent_until(one: ViewerRequest, end: float, arrives: list[tuple[float, str, b
         ("h264", [], [UP, H264], [OFF, DOWN]),
         (None, [], [UP, ON], [OFF, DOWN]),
         ("h264", [(0.0, FLAG, b"true")], [H264], [OFF]),  # whoever has raised it lowers it
-        (None, [(0.0, FLAG, b"true")], [ON], [OFF]),
-        ("h264", [(0.0, FLAG, b"?")], [UP, H264], [OFF, DOWN]),
         ("h264", [(0.5, FLAG, b"false")], [UP, H264], [OFF]),  # by another operator: it stays down
         (None, [(0.0, FLAG, b"true"), (0.1, CAMERA, b"a picture")], [], []),  # another has requested it
         ("h264", [(0.0, FLAG, b"true"), (0.1, CAMERA, b"a picture")], [H264], [OFF]),

@@ -5,19 +5,20 @@ from __future__ import annotations
 import functools
 import json
 import re
-import subprocess
-import sys
-from pathlib import Path
+from functools import reduce
 from typing import Any
 
 import jsonschema
 import pytest
+import yaml
 
 from pebble import contract as c
 from pebble.contract import CHANNELS, Channel, codec
-from pebble.contract.payloads import ChargingLevel, Drive, Heartbeat, TouchSensors, TouchValues
+from pebble.contract.payloads import Drive, TouchSensors, TouchValues
 from pebble.extensions.operator.contract import docs as topic_docs
+from pebble.extensions.operator.contract.asyncapi import document
 from pebble.extensions.operator.contract.schemas import schemas
+from tests.kit.npm import package
 from tests.support import ROOT
 
 PAGE = (ROOT / "docs" / "topics.md").read_text()
@@ -39,31 +40,11 @@ def test_an_example_of_the_page_is_valid(channel: Channel) -> None:
     codec.decode(channel, ROWS[channel.suffix].encode())
 
 
-def test_running_the_module_writes_the_files(tmp_path: Path) -> None:
-    subprocess.run(
-        [sys.executable, "-m", "pebble.extensions.operator.contract.docs", str(tmp_path)],
-        cwd=ROOT,
-        check=True,
-        timeout=60,
-    )
-    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == topic_docs.documents()
-
-
-def test_every_link_leads_to_a_payload() -> None:
-    text = topics_document()
-    headings = {heading.lower() for heading in re.findall(r"^### (\w+)$", text, re.MULTILINE)}
-    links = set(re.findall(r"\]\(#(\w+)\)", text))
-    assert links <= headings
-    assert {"drive", "touchvalues", "imuhealth"} <= links
-
-
 @pytest.mark.parametrize(
     ("channel", "value"),
     [
         (c.DRIVE, Drive(x=0.5)),
         (c.MQTT_VIDEO, True),
-        (c.ONLINE, Heartbeat(t=1710969600123)),
-        (c.CHARGING_LEVEL, ChargingLevel(value=7.4)),
         (c.TOUCH_SENSORS, TouchSensors(value=TouchValues(a0=1, a1=2, a2=3))),
     ],
     ids=lambda value: getattr(value, "metric", ""),
@@ -82,3 +63,24 @@ def checked_schemas() -> dict[str, Any]:
     for schema in ({"$defs": document["$defs"]}, *document["topics"].values()):
         jsonschema.Draft202012Validator.check_schema(schema)
     return document
+
+
+# -- the AsyncAPI document
+
+
+def at(whole: Any, reference: str) -> Any:
+    """Return the part of a document that a reference names; raises KeyError."""
+    keys = [key.replace("~1", "/").replace("~0", "~") for key in reference.removeprefix("#/").split("/")]
+    return reduce(lambda part, key: part[key], keys, whole)
+
+
+def test_it_is_valid_and_has_every_channel() -> None:
+    schema = json.loads((package("@asyncapi/specs") / "schemas" / "3.0.0-without-$id.json").read_text())
+    whole = yaml.safe_load(document())
+    jsonschema.Draft7Validator(schema).validate(whole)
+    actions = {"incoming": "receive", "outgoing": "send"}
+    levels = "{system}/{type}/{id}"
+    operations = whole["operations"].values()
+    assert [(at(whole, one["channel"]["$ref"])["address"], one["action"]) for one in operations] == [
+        (f"{levels}/{one.suffix}", actions[one.direction]) for one in CHANNELS
+    ]

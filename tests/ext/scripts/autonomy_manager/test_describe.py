@@ -30,17 +30,11 @@ def entry(tmp_path: Path) -> Path:
     [
         ("from pebble import run", True),
         ("from pebble import camera, run as go", True),
-        ("from pebble.script import Robot", True),
         ("import pebble.script", True),
-        ("def main():\n    from pebble import run\n", True),
         ("from pebble import camera", False),
-        ("import pebble", False),
         ("'''\nfrom pebble.script import run\n'''", False),
-        ("# from pebble import run", False),
         ("from .pebble import run", False),
-        ("from pebble.scripts import run", False),
         ("x = 1\0", False),
-        ("import argparse\nprint(open('asked', 'w'))", False),
     ],
 )
 def test_only_what_imports_our_script_module_is_ours(entry: Path, text: str, ours: bool) -> None:
@@ -49,10 +43,9 @@ def test_only_what_imports_our_script_module_is_ours(entry: Path, text: str, our
 
 
 def test_what_is_no_python_is_named_with_its_line_and_no_other_file_is_ours(entry: Path) -> None:
-    for text in ("def broken(:", "(" * 5000):
-        entry.write_text(text)
-        with pytest.raises(DescribeError, match=r"^run\.py, line 1: "):
-            is_ours(entry)
+    entry.write_text("(" * 5000)
+    with pytest.raises(DescribeError, match=r"^run\.py, line 1: "):
+        is_ours(entry)
     (shell := entry.with_name("run.sh")).write_text("from pebble import run")
     assert not is_ours(shell)
     assert not is_ours(entry.with_name("missing.py"))
@@ -81,13 +74,8 @@ def test_the_last_line_of_the_answer_counts(entry: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        (
-            "import no_such_module",
-            "its --describe ended with code 1: ModuleNotFoundError: No module named",
-        ),
-        ("raise SystemExit(3)", "its --describe ended with code 3"),
+        ("import no_such_module", "its --describe ended with code 1: ModuleNotFoundError: No module named"),
         ("print('hello')", "its --describe: JSON is malformed"),
-        ('print(\'{"configs": [{"label": 1}]}\')', "its --describe: "),
         ('print(\'{"configs": [{"key": "a"}, {"key": "a"}]}\')', "two settings have the same key"),
         ("import sys\nsys.stdout.write('x' * 300_000)", "its --describe is longer than 262144 bytes"),
         (r"""raise SystemExit("\x1b[31mred\r12:00:00 [ERROR] forged")""", "code 1: "),
@@ -127,11 +115,8 @@ def test_a_manifest_describes_a_script_of_any_language(tmp_path: Path) -> None:
 
 CONTROL = (
     r'{"label": "\u001b[31mred"}',
-    r'{"summary": "two\nlines"}',
     r'{"configs": [{"key": "a\nb"}]}',
-    r'{"configs": [{"key": "a", "label": "\u202e"}]}',
     r'{"configs": [{"key": "a", "arg": "--a\u0000"}]}',
-    r'{"configs": [{"key": "a", "type": "enum", "options": ["\r"]}]}',
 )
 
 

@@ -76,21 +76,12 @@ def test_it_begins_idle_and_stops_what_a_predecessor_may_have_left(bench: Bench)
     assert until(lambda: bench.drives[-1] == zero), "else a person who stops it before it drives would not end it"
 
 
-def test_a_script_of_others_gets_no_run_and_is_killed_with_the_manager(bench: Bench) -> None:
-    old = bench.start("old")
-    assert "PEBBLE_RUN" not in old.launch.environment
-    assert old.launch.tie is KILL
-
-
 @pytest.mark.parametrize(
     "body",
     [
         {"action": "RUN ", "file": " walk "},
-        {"enabled": True, "file": "walk"},
         {"value": {"enabled": True, "file": "walk"}},
-        {"value": {"action": "on"}, "file": "walk", "config": {"speed": 0.5}},
         {"value": True, "file": "walk"},
-        {"action": "?", "enabled": True, "file": "walk"},
     ],
 )
 def test_a_start_has_many_forms_and_so_has_a_stop(bench: Bench, body: dict[str, Any]) -> None:
@@ -115,17 +106,6 @@ def test_a_refused_start_leaves_the_running_script_alone(bench: Bench, body: Any
     bench.command(body)
     assert bench.becomes(running=True, file="walk", pid=walk.pid, error=error)
     assert walk.signals == []
-    bench.command({"action": "stop"})
-    walk.end(0)
-    assert bench.becomes(**IDLE)
-
-
-def test_nonsense_does_nothing(bench: Bench) -> None:
-    walk = bench.start("walk")
-    for body in ({"file": "sing"}, {"action": "dance"}, b"\xff", b"[" * 5000, 7, {"action": "stop", "config": 3}):
-        bench.command(body)
-    bench.quiet()
-    assert (walk.signals, bench.children.files) == ([], ["walk"])
 
 
 def test_stop_halts_the_wheels_and_the_run_that_has_ended_is_barred(bench: Bench) -> None:
@@ -209,17 +189,16 @@ def test_dependencies_come_first_with_the_same_run_and_go_last(bench: Bench) -> 
     assert bench.becomes(running=True, file="walk", error=None, dependencies=[])
 
 
-@pytest.mark.parametrize(("code", "how"), [(0, "exited with code 0"), (-11, "was ended by signal 11")])
-def test_a_dependencys_end_stops_the_script(bench: Bench, code: int, how: str) -> None:
+def test_a_dependencys_end_stops_the_script(bench: Bench) -> None:
     follow = bench.start("follow")
     eyes, wheel, _ = bench.children.all
-    eyes.end(code)
+    eyes.end(0)
     assert until(lambda: follow.signals == [TERM])
     assert until(lambda: bench.zeros(run_of(follow)) == 1)
     follow.end(1)
     assert until(lambda: wheel.signals == [TERM])
     wheel.end(0)
-    assert bench.becomes(**{**IDLE, "error": f"dependency eyes {how}"})
+    assert bench.becomes(**{**IDLE, "error": "dependency eyes exited with code 0"})
 
 
 def test_what_cannot_be_started_ends_what_was_started_for_it(bench: Bench) -> None:
@@ -235,14 +214,10 @@ def test_what_cannot_be_started_ends_what_was_started_for_it(bench: Bench) -> No
 # -- motor owners
 
 
-def test_a_run_is_above_what_motor_owners_have_barred(bench: Bench) -> None:
-    bench.owner(barred=500_000_000)
-    assert run_of(bench.start("walk")) > 500_000_000
-
-
 def test_an_emergency_stop_ends_the_script_and_refuses_others_until_the_reset(bench: Bench) -> None:
-    bench.owner()
+    bench.owner(barred=500_000_000)
     walk = bench.start("walk")
+    assert run_of(walk) > 500_000_000
     bench.owner(latched=True, count=1, by="ann")
     error = "emergency stop by ann of motor owner serial: reset it first"
     assert bench.becomes(error=error)
@@ -257,7 +232,7 @@ def test_an_emergency_stop_ends_the_script_and_refuses_others_until_the_reset(be
     bench.start("sing")
 
 
-@pytest.mark.parametrize(("file", "signals"), [("count", []), ("stride", []), ("pace", [TERM]), ("old", [TERM])])
+@pytest.mark.parametrize(("file", "signals"), [("stride", []), ("pace", [TERM]), ("old", [TERM])])
 def test_only_what_declares_no_drive_with_all_that_it_needs_lives_through_a_stop(
     bench: Bench, file: str, signals: list[signal.Signals]
 ) -> None:
@@ -307,12 +282,11 @@ KEY = {"key": "0badf00d"}
 @pytest.mark.parametrize(
     ("drives", "status"),
     [
-        ([{"z": 0.5}, {"z": 0.0, "valid_ms": 0}], {"running": True}),
         ([{"z": 0.5, **KEY}], {"running": True, "overridden": True}),
         ([{"z": 0.5, **KEY}, {"z": 0.0, **KEY}, {"z": 0.4}], {"running": True, "overridden": True}),
         ([{"z": 0.0, "valid_ms": 0, **KEY}], {"error": OVERRIDDEN, "overridden": True}),
     ],
-    ids=["its own commands", "a person with control", "who lets go", "who stops"],
+    ids=["a person with control", "who lets go", "who stops"],
 )
 def test_who_has_control_is_told_from_a_script_that_does_not_sign(
     bench: Bench, drives: list[dict[str, Any]], status: dict[str, Any]
@@ -329,6 +303,8 @@ def test_who_has_control_is_told_from_a_script_that_does_not_sign(
 
 def test_a_script_that_does_not_sign_ends_when_the_connection_of_who_drives_is_lost(bench: Bench) -> None:
     old = bench.start("old")
+    assert "PEBBLE_RUN" not in old.launch.environment
+    assert old.launch.tie is KILL, "with the manager"
     bench.drive(z=0.5, **KEY)
     assert bench.becomes(overridden=True)
     bench.advance(2.1)
@@ -384,20 +360,11 @@ def test_where_names_are_checked_only_who_has_control_starts_a_script(tmp_path: 
     bench = Bench(tmp_path, SCRIPTS, named=True)
     try:
         bench.holder("page-1/ann")
-        for by in ("otto", "-"):
-            bench.command({"action": "start", "file": "walk", "by": by})
-            assert bench.becomes(error="page-1/ann has control, and starts scripts")
-            bench.command({"action": "start", "file": "none", "by": "page-1"})
-            assert bench.becomes(error="Unknown autonomy file: none")
+        bench.command({"action": "start", "file": "walk", "by": "otto"})
+        assert bench.becomes(error="page-1/ann has control, and starts scripts")
         bench.command({"action": "start", "file": "walk", "by": "page-1/bob"})
         assert bench.becomes(running=True, file="walk")
         bench.command({"action": "stop", "by": "otto"})
-        assert until(lambda: bench.children.all[-1].signals == [TERM])
-        bench.children.all[-1].end(0)
-        bench.start("sing")
-        bench.holder("")
-        bench.quiet()
-        bench.command({"action": "start", "file": "eyes", "by": "otto"})
         assert until(lambda: bench.children.all[-1].signals == [TERM])
     finally:
         bench.close()
@@ -408,14 +375,13 @@ def test_where_names_are_checked_only_who_has_control_starts_a_script(tmp_path: 
     [
         (lambda bench: None, {"running": True, "file": "walk"}),
         (lambda bench: bench.command({"action": "stop"}), {"running": False, "error": None}),
-        (lambda bench: bench.drive(z=0.5), {"running": False, "error": None}),
         (lambda bench: bench.owner(latched=True, count=1), {"running": False, "error": None}),
         (
             lambda bench: bench.advance(3.01),
             {"error": "Unknown autonomy file: walk: scripts are still being listed, try again"},
         ),
     ],
-    ids=["nothing", "a stop", "a person drives", "an emergency stop", "three seconds"],
+    ids=["nothing", "a stop", "an emergency stop", "three seconds"],
 )
 def test_a_start_waits_until_its_script_is_listed_unless_something_comes_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, between: Callable[[Bench], None], status: dict[str, Any]

@@ -9,9 +9,9 @@ import pytest
 
 from pebble.contract.payloads import MotorPower
 from pebble.extensions.lab.simulation.motion import FULL_SPEED_MM_S, TRACK_MM
+from pebble.extensions.scripts.perception.hall import HallSample, HallWheel, SensorRange
 from pebble.extensions.scripts.perception.odometry import Directions, OdometrySettings
 from tests.ext.scripts.perception.wheels_rig import WheelsRig
-from tests.support import cases, some
 
 ONE_SENSOR = OdometrySettings(second_channel="none")
 FIELDS = """
@@ -22,7 +22,7 @@ FIELDS = """
 """
 
 
-@pytest.mark.parametrize(("power", "start"), some([(0.1, 1), (0.4, 3), (0.7, 5), (1.0, 7), (-1.0, 2)], 2))
+@pytest.mark.parametrize(("power", "start"), [(0.4, 3), (-1.0, 2)])
 @pytest.mark.parametrize("geometry", [None, ONE_SENSOR])
 def test_2_m_straight_are_right_within_10_mm(power: float, start: int, geometry: OdometrySettings | None) -> None:
     rig = WheelsRig(geometry=geometry, start_mm=(start * 5.3, start * 3.7))
@@ -48,10 +48,9 @@ def test_a_square_ends_where_it_began(side: int, gyro: bool) -> None:
     assert rig.odometry.value().get("heading_source") == {True: "gyro", False: None}[gyro]
 
 
-@pytest.mark.parametrize("seed", range(cases(1, 3)))
-def test_reversals_without_a_stop_lose_no_step(seed: int) -> None:
+def test_reversals_without_a_stop_lose_no_step() -> None:
     """Twenty random commands, each straight after the other."""
-    rig, chosen = WheelsRig(noise=3.0, start_mm=(seed * 5.3, seed * 3.7)), random.Random(seed)
+    rig, chosen = WheelsRig(noise=3.0), random.Random(0)
     rig.wait(0.5)
     for _ in range(20):
         rig.drive(chosen.uniform(0.2, 2.0), x=chosen.uniform(-1, 1), z=chosen.uniform(-1, 1))
@@ -84,18 +83,6 @@ def test_moving_ends_and_standing_adds_no_distance_although_the_sensors_are_nois
     assert rig.odometry.distance_mm == pytest.approx(before, abs=1)
 
 
-def test_a_wheel_that_is_held_is_a_stall_and_no_distance() -> None:
-    rig = WheelsRig()
-    rig.drive(2.0, z=0.5)
-    rig.stop()
-    before = rig.odometry.distance_mm
-    rig.mcu.body.forward = lambda _left, _right: (0.0, 0.0)  # type: ignore[method-assign]
-    rig.drive(3.0, z=0.5)
-    value = rig.odometry.value()
-    assert (value["left_stall_events"], value["right_stall_events"]) == (1, 1)
-    assert value["distance_mm"] == pytest.approx(before, abs=6)
-
-
 def test_a_push_without_a_command_is_of_unknown_direction() -> None:
     rig = WheelsRig(geometry=ONE_SENSOR)
     rig.drive(2.0, z=0.5)
@@ -109,7 +96,7 @@ def test_a_push_without_a_command_is_of_unknown_direction() -> None:
     assert (value["x_mm"], value["left_mm"]) == (before["x_mm"], before["left_mm"])
 
 
-@pytest.mark.parametrize(("coasted_s", "directions"), [(0.0, (1, -1)), (0.35, (1, -1)), (0.36, (0, 0)), (9.0, (0, 0))])
+@pytest.mark.parametrize(("coasted_s", "directions"), [(0.35, (1, -1)), (0.36, (0, 0))])
 def test_a_direction_stays_for_as_long_as_wheels_coast(coasted_s: float, directions: tuple[int, int]) -> None:
     power = Directions(0.0)
     assert power.at(0.0) == ((0.0, 0), (0.0, 0))
@@ -129,9 +116,58 @@ def test_an_inertial_sensor_that_lies_otherwise_is_not_believed() -> None:
     assert rig.odometry.moving(rig.now)
 
 
-def test_steps_are_counted_slowly_too() -> None:
-    rig = WheelsRig()
-    rig.drive(20.0, z=0.05)
-    rig.stop()
-    assert rig.error_mm() < 5
-    assert rig.odometry.value()["left_crossings"] == round(rig.motion.left_mm // (math.pi * 6.1))
+# -- one wheel's hall sensor, from samples that are made here
+
+
+STEP_MM = 10.0
+
+
+def sample(phase: float, *, power: float = 0.5, amplitude: float = 297.0, second: float | None = None) -> HallSample:
+    """``second``: 1 or −1, on which side of the first one the second sensor is."""
+    quadrature = None if second is None else round(512 - second * amplitude * math.cos(phase))
+    return HallSample(round(512 + amplitude * math.sin(phase)), quadrature, power, (power > 0) - (power < 0))
+
+
+@pytest.mark.parametrize("second", [None, 1.0, -1.0])
+@pytest.mark.parametrize("start", [0.3, 4.0])
+def test_the_distance_is_exact_between_steps(second: float | None, start: float) -> None:
+    wheel = HallWheel(STEP_MM)
+    for number in range(401):
+        wheel.update(sample(start + 0.1 * number, second=second))
+    assert wheel.mm == pytest.approx(40.0 / math.pi * STEP_MM, abs=0.3)
+    assert wheel.steps == pytest.approx(40.0 / math.pi, abs=0.2)
+    assert 12 <= wheel.extrema <= 14
+
+
+def test_a_second_sensor_shows_a_direction_against_the_command() -> None:
+    wheel = HallWheel(STEP_MM)
+    for number in range(400):
+        wheel.update(sample(0.2 * number, second=1.0))
+    before = wheel.mm
+    for number in range(100):
+        wheel.update(sample(0.2 * (399 - number), second=1.0))  # pushed back, while it is commanded to go on
+    assert wheel.mm - before == pytest.approx(-19.8 / math.pi * STEP_MM, abs=0.5)
+
+
+def test_less_than_a_swing_is_no_motion() -> None:
+    wheel = HallWheel(STEP_MM)
+    for number in range(1000):
+        wheel.update(sample(0.3 * number, amplitude=10.0))
+    assert (wheel.mm, wheel.steps, wheel.ready) == (0.0, 0.0, True)
+
+
+def test_the_range_follows_a_signal_that_becomes_smaller() -> None:
+    sensor = SensorRange()
+    for number in range(20_000):
+        sensor.update(512 + (300 if number < 200 else 200) * math.sin(0.3 * number))
+    assert (sensor.low, sensor.high) == (pytest.approx(312, abs=8), pytest.approx(712, abs=8))
+    assert sensor.level(512) == pytest.approx(0.0, abs=0.02)
+
+
+def test_a_wheel_that_stands_for_long_forgets_its_rest() -> None:
+    wheel = HallWheel(STEP_MM)
+    for _ in range(5000):
+        wheel.update(sample(0.7, power=0.0))
+    for number in range(400):
+        wheel.update(sample(0.7 + 0.1 * number))
+    assert wheel.mm == pytest.approx(39.9 / math.pi * STEP_MM, abs=0.5)

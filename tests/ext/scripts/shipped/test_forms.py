@@ -20,17 +20,8 @@ from tests.support import ROOT
 SCRIPTS = ROOT / "pebble/extensions/scripts/shipped"
 NAMES = ("apriltag-follow", "apriltag-locations", "apriltag-odom-follow", "wheel-odometry")
 #: Those for sizes that the camera decides, for other topics, and for nothing.
-GONE = {
-    "width",
-    "height",
-    "fps",
-    "min_wheel_pwm",
-    "locations_topic",
-    "overlays_topic",
-    "tags_topic",
-    "odom_topic",
-    "topic",
-}
+GONE = {"width", "height", "fps", "min_wheel_pwm"}
+GONE |= {"locations_topic", "overlays_topic", "tags_topic", "odom_topic", "topic"}
 #: Without a path that an operator chooses, a window on the robot's screen, and a topic that the original does not use.
 ORIGINALS = json.loads((ROOT / "tests" / "data" / "original-forms.json").read_text())
 
@@ -43,8 +34,11 @@ def described(name: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_those_that_only_measure_say_so(name: str) -> None:
-    assert described(name).get("drives", True) is (name not in ("apriltag-locations", "wheel-odometry"))
+def test_each_has_a_sentence_and_main_settings_and_those_that_only_measure_say_so(name: str) -> None:
+    found = described(name)
+    assert found.get("drives", True) is (name not in ("apriltag-locations", "wheel-odometry"))
+    assert 10 < len(found["summary"]) <= 160
+    assert 1 < len(found["main"]) <= 3
 
 
 @pytest.mark.parametrize("name", ORIGINALS)
@@ -70,7 +64,6 @@ def test_following_by_odometry_has_27_settings_and_needs_two_scripts() -> None:
     [
         ({"left_mm_per_event": 10.1, "right_mm_per_event": 10.3, "track_width_mm": 128.0}, 128.0, "counts steps twice"),
         ({"left_mm_per_event": 10.1}, 130.5, "counts steps twice"),
-        ({"track_width_mm": 128.0}, 128.0, ""),
     ],
 )
 def test_of_the_originals_tuning_only_the_width_of_the_track_counts(
@@ -92,11 +85,9 @@ MEASURED = {"left_step_mm": 19.36, "right_step_mm": 18.97, "track_mm": 134.4}
     ("change", "options", "wheels", "remark"),
     [
         ({}, {}, (19.36, 18.97, 134.4), ""),
-        ({}, {"use_tune_state": True}, (19.36, 18.97, 134.4), ""),
         ({}, {"track_width_mm": 120.0}, (19.36, 18.97, 120.0), ""),
         ({}, {"left_mm_per_event": 19.0, "right_mm_per_event": 18.0}, (19.0, 18.0, 134.4), ""),
         ({"counts": "twice"}, {}, (0, 0, 130.5), "odometry.json: Invalid enum value 'twice'"),
-        ({"track_mm": -1}, {}, (0, 0, 130.5), "the geometry counts"),
     ],
 )
 def test_the_calibration_of_its_folder_counts_unless_options_say_otherwise(
@@ -109,13 +100,6 @@ def test_the_calibration_of_its_folder_counts_unless_options_say_otherwise(
     assert (tuned.left_mm_per_event, tuned.right_mm_per_event, tuned.track_width_mm) == wheels
     assert remark in caplog.text
     assert bool(remark) == bool(caplog.text)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_each_has_a_sentence_and_main_settings(name: str) -> None:
-    found = described(name)
-    assert 10 < len(found["summary"]) <= 160
-    assert 1 < len(found["main"]) <= 3
 
 
 def test_the_tags_size_must_be_given_or_confirmed() -> None:
