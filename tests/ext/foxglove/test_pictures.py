@@ -26,7 +26,7 @@ from tests.ext.page.media.robots import (
     capabilities,
 )
 from tests.kit.scene import read_counter
-from tests.support import Broker, some, until
+from tests.support import Broker, until
 
 H264, JPEG, SAMPLES = f"{CAMERA}/video", f"{CAMERA}/image", f"{SOUND}/sound"
 REQUESTED, WITHDRAWN = {"enabled": True, "encoding": "h264"}, {"enabled": False}
@@ -104,7 +104,7 @@ def test_a_client_that_comes_later_begins_with_a_key_frame(broker: Broker) -> No
         assert until(lambda: robot.requests[-1] == WITHDRAWN, 20)
 
 
-@pytest.mark.parametrize("encoding", ["json", "pbvd", "h264"])
+@pytest.mark.parametrize("encoding", ["json", "h264"])
 def test_pictures_of_every_encoding_become_jpegs(broker: Broker, encoding: str) -> None:
     with filming(broker, encoding=encoding) as robot, live(broker) as server:
         watcher = Watcher(server.address)
@@ -116,17 +116,15 @@ def test_pictures_of_every_encoding_become_jpegs(broker: Broker, encoding: str) 
     assert follow_each_other(counters(list(map(decoded, images))))
 
 
-@pytest.mark.parametrize("by", some([signal.SIGTERM, signal.SIGINT, signal.SIGHUP], 3))
-def test_a_signal_withdraws_the_requests(broker: Broker, by: signal.Signals) -> None:
+def test_a_signal_withdraws_the_requests(broker: Broker) -> None:
     with filming(broker) as robot:
         server = Live(broker)
         watcher = Watcher(server.address)
         watcher.subscribe(H264)
         assert until(lambda: watcher.count(H264), 30)
-        code, errors, seconds = server.end(by)
+        code, errors = server.end(signal.SIGTERM)
         assert (code, errors.splitlines()[1:]) == (0, [])
         assert errors.startswith("Showed 1 robots in ")
-        assert seconds < 5
         assert until(lambda: robot.requests[-1] == WITHDRAWN and robot.flags == [True, False])
         assert until(lambda: watcher.closed)
 
@@ -142,9 +140,8 @@ def test_why_there_are_no_pictures_is_shown_in_foxglove(broker: Broker) -> None:
         assert until(lambda: robot.requests[-1] == WITHDRAWN, 20)
 
 
-@pytest.mark.parametrize("encoding", ["pcm", "opus"])
-def test_sound_becomes_samples(broker: Broker, encoding: str) -> None:
-    robot = SoundRobot({**AUDIO, "encoding": encoding}, transport=client(broker))
+def test_sound_becomes_samples(broker: Broker) -> None:
+    robot = SoundRobot({**AUDIO, "encoding": "opus"}, transport=client(broker))
     try:
         with live(broker) as server:
             watcher = Watcher(server.address)

@@ -6,16 +6,28 @@ import json
 import math
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
-from pebble.contract import APRILTAG_DATA, AUTONOMY_STATUS, CHARGING_LEVEL, LOGS
+from pebble.contract import (
+    APRILTAG_DATA,
+    AUTONOMY_STATUS,
+    CHANNELS,
+    CHARGING_LEVEL,
+    IMU,
+    LOGS,
+    OUTGOING,
+    STATUS,
+    Channel,
+)
 from pebble.contract.payloads import (
     AutonomyStatus,
     ChargingLevel,
     LogRecord,
     TagData,
 )
+from pebble.extensions.foxglove.json_channels import json_spec
 from pebble.transports import Message, QoS, Transport
 from tests.ext.foxglove.live import FRED, GOOB, client, live, online, publish
 from tests.ext.foxglove.watcher import Watcher
@@ -121,23 +133,6 @@ def test_clients_only_look(broker: Broker, robot: Transport) -> None:
     assert received == []
 
 
-def test_many_robots_at_once_do_not_lose_a_client(broker: Broker, robot: Transport) -> None:
-    metrics = ("online", "status", "charging-level", "charging-status")
-    topics = {f"pebble/robots/r{number}/outgoing/{metric}" for number in range(300) for metric in metrics}
-    with live(broker) as server:
-        watcher = Watcher(server.address)
-        assert until(lambda: watcher.info)
-
-        def shown() -> bool:
-            """A broker queues no more than 1,000 messages for a slow reader: what is missing comes again."""
-            for topic in topics - set(watcher.channels):
-                robot.publish(topic, b'{"t": 1}', qos=QoS.DELIVERED)
-            return topics <= set(watcher.channels)
-
-        assert until(shown, 30, step=0.5)
-        assert not watcher.closed
-
-
 def test_a_broker_that_goes_is_a_problem_in_foxglove_and_one_that_is_back_goes_on(
     broker: Broker, robot: Transport
 ) -> None:
@@ -156,3 +151,31 @@ def test_a_broker_that_goes_is_a_problem_in_foxglove_and_one_that_is_back_goes_o
             return {"t": 2} in watcher.of(ONLINE)
 
         assert until(published, 30, step=0.1)
+
+
+# -- the contract's schemas, in the part of JSON Schema that Foxglove reads
+
+TELEMETRY = [channel for channel in CHANNELS if channel.direction == OUTGOING and channel.payload is not bytes]
+
+
+def check(schema: dict[str, Any]) -> None:
+    """Parses as foxglove/studio does (packages/mcap-support/src/parseJsonSchema.ts), which refuses everything else."""
+    assert schema["type"] == "object"
+    for field in schema["properties"].values():
+        items = field["items"] if field["type"] == "array" else field
+        assert items["type"] in ("boolean", "string", "number", "integer", "object")
+        if items["type"] == "object":
+            check(items)
+
+
+@pytest.mark.parametrize("channel", TELEMETRY, ids=lambda channel: channel.suffix)
+def test_foxglove_reads_every_schema(channel: Channel) -> None:
+    spec = json_spec("topic", channel)
+    assert (spec.encoding, spec.schema_encoding) == ("json", "jsonschema")
+    check(json.loads(spec.schema or b'{"type": "object", "properties": {}}'))
+
+
+def test_a_payload_that_no_schema_covers_may_be_any_json() -> None:
+    assert json_spec("topic", STATUS)[2:] == ("pebble.Any", "jsonschema", b"")
+    assert json_spec("topic", None)[2:] == ("pebble.Any", "jsonschema", b"")
+    assert "orientation_deg" in json.loads(json_spec("topic", IMU).schema)["properties"]["value"]["properties"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 import wave
 from pathlib import Path
@@ -68,8 +67,8 @@ class Soundboard(ProgramRobot):
         write_wav(self.sounds / name, tone(seconds))
         return self.start()
 
-    def send(self, body: Any, *, retain: bool = False) -> None:
-        self.world.command("soundboard-command", body, retain=retain)
+    def send(self, body: Any) -> None:
+        self.world.command("soundboard-command", body)
 
     def play(self, file: str, **more: Any) -> None:
         self.send({"action": "play", "file": file, **more})
@@ -113,13 +112,12 @@ class Soundboard(ProgramRobot):
         one = self.played[number]
         return np.frombuffer(one.frames(), "<i2").reshape(-1, one.channels)
 
-    def hold_loudspeaker(self, path: Path) -> subprocess.Popen[bytes]:
+    def hold_loudspeaker(self, path: Path) -> None:
         """Another program plays ``path``."""
         process = Child([*self.player, str(path)], cwd=ROOT)
         self._ends.callback(process.wait, 10)
         self._ends.callback(process.kill)
         assert until(lambda: len(self.played) == 1)
-        return process
 
     def players(self) -> list[int]:
         """The processes that this service has started and that run."""

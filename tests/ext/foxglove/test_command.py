@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from pathlib import Path
 
@@ -25,9 +24,8 @@ def test_which_robots_are_shown_has_to_be_named(run: Run, tmp_path: Path) -> Non
     assert run.err == "pebble: Foxglove needs the robots' broker: use --url mqtt://HOST[:PORT] or mqtts://…\n"
 
 
-@pytest.mark.parametrize("module", ["foxglove", "foxglove_schemas_protobuf.RawAudio_pb2"])
-def test_without_its_packages_one_line_names_the_extra(run: Run, module: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, module, None)
+def test_without_its_packages_one_line_names_the_extra(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "foxglove_schemas_protobuf.RawAudio_pb2", None)
     assert run("foxglove", "--url", "mqtt://127.0.0.1") == 1
     assert 'pip install "pebble-robot[foxglove]"' in run.err
     assert run.err.count("\n") == 1
@@ -39,7 +37,7 @@ def test_other_machines_are_let_in_only_with_two_options(run: Run, broker: Broke
     assert run.err.startswith("pebble: --host 0.0.0.0: other machines could watch and listen without a login")
     assert run.err.rstrip().endswith("add --no-login")
     server = Live(broker, "--host", "0.0.0.0", "--no-login")
-    _, errors, _ = server.end()
+    _, errors = server.end()
     assert "everybody on the network can watch and listen, without a login and unencrypted" in errors
 
 
@@ -56,16 +54,3 @@ def test_a_config_shows_its_robot_at_its_remote_broker(tmp_path: Path, broker: B
     assert list(watcher.channels) == [f"{GOOB}/outgoing/online"]
     server.end()
     robot.close()
-
-
-@pytest.mark.parametrize(
-    ("module", "absent"),
-    [
-        ("pebble.extensions.foxglove.command", {"foxglove", "google.protobuf", "av", "cv2"}),
-        ("pebble.extensions.foxglove.run", {"foxglove", "av", "starlette", "uvicorn", "websockets"}),
-    ],
-)
-def test_heavy_packages_are_imported_only_when_they_are_used(module: str, absent: set[str]) -> None:
-    code = f"import sys, {module}\nprint(sorted({absent!r} & set(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "[]\n"
