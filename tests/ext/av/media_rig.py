@@ -20,7 +20,7 @@ from tests.support import until
 
 
 class MediaProgram(ProgramRobot):
-    """The service called ``name`` of a robot with ``kind`` inside, and what it reports there.
+    """The service called ``name`` of a robot, and what it reports inside.
 
     ``section`` of services.mqtt_bridge.media holds the ``options``; operators' requests come on ``request``.
     """
@@ -28,11 +28,11 @@ class MediaProgram(ProgramRobot):
     process: Program
 
     def __init__(
-        self, name: str, section: str, request: str, kind: str, local_port: int, remote_port: int, **options: Any
+        self, name: str, section: str, request: str, local_port: int, remote_port: int, **options: Any
     ) -> None:
         remote = {"host": "127.0.0.1", "port": remote_port, "silence_seconds": SILENCE_S}
         bridge = {"enabled": True, "remote_mqtt": remote, "media": {section: options}}
-        super().__init__(kind, local_port, {"mqtt_bridge": bridge}, robot=ROBOT)
+        super().__init__("mqtt", local_port, {"mqtt_bridge": bridge}, robot=ROBOT)
         self.name, self._request, self.run_dir = name, request, self.config.run_dir()
 
     def __enter__(self) -> Self:

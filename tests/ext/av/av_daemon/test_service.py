@@ -1,4 +1,4 @@
-"""av_daemon as a real process, on robots of either transport: frames, what it says of them, and how it ends."""
+"""av_daemon as a real process: frames, what it says of them, and how it ends."""
 
 from __future__ import annotations
 
@@ -52,27 +52,27 @@ class Robot(ProgramRobot):
 
 
 @pytest.fixture
-def robot(request: pytest.FixtureRequest, local: Broker) -> Iterator[Robot]:
-    """A robot of its own; its section is the parameter, if there is one."""
-    with Robot("mqtt", local.port, getattr(request, "param", SYNTHETIC)) as robot:
+def robot(local: Broker) -> Iterator[Robot]:
+    """A robot for this test alone."""
+    with Robot("mqtt", local.port, SYNTHETIC) as robot:
         yield robot
 
 
-@pytest.fixture(scope="module", params=["mqtt", "zenoh"])
-def running(request: pytest.FixtureRequest, local: Broker) -> Iterator[Robot]:
-    """One robot of each kind, for tests that leave it as it was."""
-    with Robot(request.param, local.port, SYNTHETIC) as robot:
+@pytest.fixture(scope="module")
+def running(local: Broker) -> Iterator[Robot]:
+    """One robot for tests that leave it as it was."""
+    with Robot("zenoh", local.port, SYNTHETIC) as robot:
         yield robot
 
 
 def test_pictures_arrive_and_their_counter_keeps_the_rate(running: Robot) -> None:
     with FrameReader(running.run_dir, "camera", depth=3) as reader:
-        frames = [reader.read(10) for _ in range(40)]
+        frames = [reader.read(10) for _ in range(20)]
     numbers = [read_counter(frame.picture()) for frame in frames if frame is not None]
-    assert len(numbers) == 40
+    assert len(numbers) == 20
     assert None not in numbers
     starts = [frame.info.captured_ns / 1e9 - number / 30 for frame, number in zip(frames, numbers, strict=True)]
-    assert min(starts[:20]) == pytest.approx(min(starts[20:]), abs=0.1)  # a busy machine is late now and then
+    assert min(starts[:10]) == pytest.approx(min(starts[10:]), abs=0.1)  # a busy machine is late now and then
     assert frames[0].info.format == "bgr24"
     assert abs(frames[-1].info.captured_ms / 1e3 - time.time()) < 10
 
@@ -114,7 +114,7 @@ def test_numbers_alone_are_published_rarely_and_everything_else_soon(robot: Robo
     sent(200)
     assert until(lambda: "other" in robot.status)
     before = len(robot.world.on("media-status"))
-    for kbits in range(201, 211):
+    for kbits in range(201, 206):
         sent(kbits)
         time.sleep(0.3)
     assert len(robot.world.on("media-status")) - before <= 1
@@ -130,33 +130,16 @@ def test_it_ends_at_once_and_publishes_it(robot: Robot) -> None:
     assert until(lambda: robot.status["camera"] == {"running": False, "doing": "ended"})
 
 
-@pytest.fixture
-def rpicam(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Installed:
-    return Installed(monkeypatch, tmp_path, "rpicam-vid", "tests.fakes.fake_rpicam")
-
-
-@pytest.mark.parametrize("robot", [DEAF], indirect=True)
-class TestWithCaptureProgram:
-    def test_a_killed_one_is_back_and_the_reader_never_noticed(self, rpicam: Installed, robot: Robot) -> None:
-        with FrameReader(robot.run_dir, "camera") as reader:
-            first = reader.read(10)
-            os.kill(rpicam.pids[-1], signal.SIGKILL)
-            assert until(lambda: len(rpicam.pids) == 2)
-            later = [reader.read(10) for _ in range(10)][-1]
-            assert later.info.writer == first.info.writer
-            assert read_counter(later.picture()) is not None
-            assert robot.reported("camera", restarts=1)
-            assert "signal 9" in robot.status["camera"]["last_error"]
-
-    def test_it_does_not_outlive_a_killed_daemon(self, rpicam: Installed, robot: Robot) -> None:
-        with FrameReader(robot.run_dir, "camera") as reader:
-            assert reader.read(10) is not None
-        robot.daemon.kill()
-        robot.daemon.wait(10)
-        assert rpicam.gone(rpicam.pids[-1])
-
-    def test_it_is_missing(self, robot: Robot) -> None:
-        """Without the fake: the status says what to install, and the daemon lives on."""
-        with FrameReader(robot.run_dir, "camera"):
-            assert until(lambda: "rpicam-apps" in robot.status.get("camera", {}).get("last_error", ""))
-        assert robot.daemon.poll() is None
+def test_a_killed_capture_program_is_back_and_the_reader_never_noticed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, local: Broker
+) -> None:
+    rpicam = Installed(monkeypatch, tmp_path, "rpicam-vid", "tests.fakes.fake_rpicam")
+    with Robot("mqtt", local.port, DEAF) as robot, FrameReader(robot.run_dir, "camera") as reader:
+        first = reader.read(10)
+        os.kill(rpicam.pids[-1], signal.SIGKILL)
+        assert until(lambda: len(rpicam.pids) == 2)
+        later = [reader.read(10) for _ in range(10)][-1]
+        assert later.info.writer == first.info.writer
+        assert read_counter(later.picture()) is not None
+        assert robot.reported("camera", restarts=1)
+        assert "signal 9" in robot.status["camera"]["last_error"]

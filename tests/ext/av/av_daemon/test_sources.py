@@ -76,9 +76,8 @@ def alsa_microphone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, opened: lis
 
 
 class TestLibcamera:
-    @pytest.mark.parametrize("form", ["auto", "mjpeg", "raw"])
-    def test_pictures_come_and_their_counter_advances(self, libcamera: Open, form: str) -> None:
-        camera = libcamera(capture_format=form)
+    def test_pictures_come_and_their_counter_advances(self, libcamera: Open) -> None:
+        camera = libcamera()
         frames = [grabbed(camera) for _ in range(8)]
         numbers = [read_counter(picture(data, info)) for info, data in frames]
         assert None not in numbers
@@ -88,14 +87,11 @@ class TestLibcamera:
         assert (data[:2].tobytes(), data[-2:].tobytes()) == (b"\xff\xd8", b"\xff\xd9")
         assert (info.format, info.stride) == ("mjpeg", 0), "its own JPEG is passed on as it is"
 
-    @pytest.mark.parametrize(
-        ("name", "program"), [("libcamera", "rpicam-vid"), ("arducam", "libcamera-vid"), ("picamera2", "libcamera-vid")]
-    )
     def test_all_its_names_mean_it_and_the_older_program_does_as_well(
-        self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, opened: list[Source], name: str, program: str
+        self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, opened: list[Source]
     ) -> None:
-        installed = Installed(monkeypatch, tmp_path, program, "tests.fakes.fake_rpicam")
-        opened.append(sources.camera(options(video={**SMALL, "backend": name}), 0.0)())
+        installed = Installed(monkeypatch, tmp_path, "libcamera-vid", "tests.fakes.fake_rpicam")
+        opened.append(sources.camera(options(video={**SMALL, "backend": "picamera2"}), 0.0)())
         grabbed(opened[0])
         assert len(installed.pids) == 1
 
@@ -122,17 +118,12 @@ def test_a_missing_program_is_named(
         opener(options(video=SMALL))
 
 
-@pytest.mark.parametrize(
-    ("source", "frames", "hung"), [("libcamera", 5, "rpicam-vid"), ("alsa_microphone", 50, "arecord")]
-)
-def test_silence_is_an_error(
-    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, source: str, frames: int, hung: str
-) -> None:
+def test_silence_is_an_error(monkeypatch: pytest.MonkeyPatch, alsa_microphone: Open) -> None:
     monkeypatch.setattr(capture_program, "SILENCE_S", 1.0)
-    device = request.getfixturevalue(source)("hangs")
-    for _ in range(frames):
+    device = alsa_microphone("hangs")
+    for _ in range(50):
         device.grab()
-    with pytest.raises(DeviceError, match=f"{hung} hangs: nothing came for 1 s"):
+    with pytest.raises(DeviceError, match="arecord hangs: nothing came for 1 s"):
         device.grab()
 
 
@@ -154,22 +145,16 @@ class TestCaptureProgram:
 
 
 class TestAlsa:
-    @pytest.mark.parametrize(("rate", "channels"), [(16_000, 1), (44_100, 2)])
-    def test_every_sample_arrives_in_order(
-        self, alsa_microphone: Open, monkeypatch: pytest.MonkeyPatch, rate: int, channels: int
-    ) -> None:
+    def test_every_sample_arrives_in_order(self, alsa_microphone: Open, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(alsa, "_BEHIND", 1000)  # however busy this machine is
-        microphone = alsa_microphone(rate=rate, channels=channels)
+        form = {"rate": 44_100, "channels": 2}
+        microphone = alsa_microphone(**form)
         frames = [grabbed(microphone) for _ in range(15)]
-        received = np.concatenate([data for _, data in frames]).view(np.int16).reshape(-1, channels)
-        assert np.array_equal(received, Speech(rate, channels).samples(0, len(received)))
-        info, size = frames[0][0], frames[0][1].size
-        assert (info.format, info.rate, info.channels) == ("s16le", rate, channels)
-        assert (
-            size
-            == sources.chunk_bytes(options(audio={"rate": rate, "channels": channels}))
-            == rate // 50 * 2 * channels
-        )
+        received = np.concatenate([data for _, data in frames]).view(np.int16).reshape(-1, 2)
+        assert np.array_equal(received, Speech(44_100, 2).samples(0, len(received)))
+        info, data = frames[0]
+        assert (info.format, info.rate, info.channels) == ("s16le", 44_100, 2)
+        assert data.size == sources.chunk_bytes(options(audio=form)) == 882 * 4
 
     def test_after_a_delay_it_continues_with_the_present(
         self, alsa_microphone: Open, monkeypatch: pytest.MonkeyPatch
@@ -203,9 +188,7 @@ class TestOpenCv:
         with pytest.raises(DeviceError, match="gives no picture"):
             opened[0].grab()
 
-    @pytest.mark.parametrize(
-        "device", ["/dev/video_none", "/nowhere/film.avi", "99", "rtsp://someone:s3cret@127.0.0.1:1/door?key=s3cret"]
-    )
+    @pytest.mark.parametrize("device", ["99", "rtsp://someone:s3cret@127.0.0.1:1/door?key=s3cret"])
     def test_what_is_not_there_is_an_error_without_a_password(self, device: str) -> None:
         with pytest.raises(DeviceError, match="cannot open") as raised:
             V4l2Camera(options(video={"device": device}).video)
@@ -312,7 +295,7 @@ class TestJpegSplitter:
         cv2.imencode(".jpg", np.full((16, 16, 3), shade, np.uint8))[1].tobytes() for shade in (0, 100, 200)
     )
 
-    @pytest.mark.parametrize("size", [1, 2, 3, 7, 100, 100_000])
+    @pytest.mark.parametrize("size", [1, 7, 100_000])
     def test_pictures_come_out_as_they_went_in(self, size: int) -> None:
         stream, splitter = b"".join(self.PICTURES), JpegSplitter()
         got = [found for at in range(0, len(stream), size) for found in splitter.feed(stream[at : at + size])]
@@ -327,11 +310,3 @@ class TestJpegSplitter:
         assert splitter.feed(stream) == [self.PICTURES[0], self.PICTURES[1]]
         assert splitter.feed(self.PICTURES[0][:-2] + bytes(20_000)) == [], "it has no end"
         assert splitter.feed(self.PICTURES[1]) == [self.PICTURES[1]]
-
-    def test_noise_never_breaks_it(self) -> None:
-        random = np.random.default_rng(3)
-        splitter = JpegSplitter(limit=5000)
-        for _ in range(3000):
-            splitter.feed(random.choice([0xFF, 0xD8, 0xD9, 0xDA, 0xE0, 0, 1], 50).astype(np.uint8).tobytes())
-        splitter.feed(bytes(6000))
-        assert splitter.feed(self.PICTURES[0])[-1:] in ([self.PICTURES[0]], [])

@@ -12,9 +12,9 @@ from pebble.services.camera_publisher.frame_selector import FrameSelector
 SECONDS = 120
 
 
-def captures(fps: float, jitter_s: float, *, lost: float = 0.0, seed: int = 1) -> list[float]:
+def captures(fps: float, jitter_s: float, *, lost: float = 0.0) -> list[float]:
     """Times of a camera's frames: each off its beat by up to ``jitter_s``, a share of them ``lost``."""
-    dice = random.Random(seed)
+    dice = random.Random(1)
     times = [1000 + number / fps + dice.uniform(-jitter_s, jitter_s) for number in range(round(SECONDS * fps))]
     return sorted(time for time in times if dice.random() >= lost)
 
@@ -28,20 +28,16 @@ def taken(pacer: FrameSelector, times: list[float]) -> list[float]:
     return chosen
 
 
-@pytest.mark.parametrize("jitter_s", [0.0, 0.002, 0.010, 0.030])
-@pytest.mark.parametrize(
-    ("camera", "wanted"),
-    [(10, 10), (10.05, 10), (12, 10), (15, 10), (30, 10), (29.97, 15), (30, 7), (60, 24), (15, 15)],
-)
+@pytest.mark.parametrize("jitter_s", [0.0, 0.010, 0.030])
+@pytest.mark.parametrize(("camera", "wanted"), [(10, 10), (10.05, 10), (15, 10), (29.97, 15), (30, 7)])
 def test_the_wanted_rate_is_what_comes_out(camera: float, wanted: float, jitter_s: float) -> None:
     chosen = taken(FrameSelector(wanted), captures(camera, jitter_s))
     assert len(chosen) / SECONDS == pytest.approx(min(camera, wanted), rel=0.01)
 
 
 def test_a_slower_camera_is_sent_whole_and_a_lost_frame_is_made_up_for() -> None:
-    for jitter_s in (0.0, 0.020):
-        times = captures(9.5, jitter_s)
-        assert len(taken(FrameSelector(10), times)) >= 0.995 * len(times)
+    times = captures(9.5, 0.020)
+    assert len(taken(FrameSelector(10), times)) >= 0.995 * len(times)
     chosen = taken(FrameSelector(10), captures(30, 0.003, lost=0.2))
     assert len(chosen) / SECONDS == pytest.approx(10, rel=0.01)
 

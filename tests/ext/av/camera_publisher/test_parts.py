@@ -31,12 +31,12 @@ from tests.kit.robot import BASE, ROBOT, Listener, Running
 from tests.support import until
 
 
-def frame(width: int = 64, height: int = 48, form: str = "bgr24") -> Frame:
+def frame(form: str = "bgr24") -> Frame:
     """Red in its upper left quarter, black elsewhere."""
-    picture = np.zeros((height, width, 3), np.uint8)
-    picture[: height // 2, : width // 2] = (0, 0, 255)
+    picture = np.zeros((48, 64, 3), np.uint8)
+    picture[:24, :32] = (0, 0, 255)
     packed = {"bgr24": np.ravel, "mjpeg": lambda made: cv2.imencode(".jpg", made)[1].reshape(-1)}
-    info = FrameInfo(captured_ns=1, captured_ms=1, format=form, width=width, height=height)
+    info = FrameInfo(captured_ns=1, captured_ms=1, format=form, width=64, height=48)
     return Frame(info, packed[form](picture), shared=False)
 
 
@@ -68,7 +68,7 @@ def test_requests_for_a_full_picture_are_answered_once_a_second() -> None:
     ("turn", "corner"), [(0, (False, False)), (90, (False, True)), (180, (True, True)), (270, (True, False))]
 )
 def test_pictures_are_turned_clockwise(form: str, turn: int, corner: tuple[bool, bool]) -> None:
-    picture = Shape(None, None, turn).picture(frame(form=form))
+    picture = Shape(None, None, turn).picture(frame(form))
     assert picture.shape == ((48, 64, 3) if turn in (0, 180) else (64, 48, 3))
     assert red_corner(picture) == corner
 
@@ -79,20 +79,16 @@ def test_pictures_are_turned_clockwise(form: str, turn: int, corner: tuple[bool,
         (None, None, 0, "1", (64, 48)),
         (32, None, 0, "1", (32, 24)),
         (None, 24, 0, "1", (32, 24)),
-        (40, 40, 0, "1", (40, 40)),
         (128, None, 0, "1", (128, 96)),
-        (None, None, 0, "1/2", (32, 24)),
-        (32, 24, 0, "3/4", (24, 18)),
-        (24, None, 90, "1", (24, 32)),
+        (32, 20, 0, "3/4", (24, 15)),
         (None, 32, 270, "1/2", (12, 16)),
         (1, 1, 0, "1/4", (1, 1)),
     ],
 )
-@pytest.mark.parametrize("form", ["bgr24", "mjpeg"])
 def test_what_is_sent_has_the_wanted_size(
-    form: str, width: int | None, height: int | None, turn: int, part: str, size: tuple[int, int]
+    width: int | None, height: int | None, turn: int, part: str, size: tuple[int, int]
 ) -> None:
-    picture = Shape(width, height, turn).picture(frame(form=form), Fraction(part))
+    picture = Shape(width, height, turn).picture(frame("mjpeg"), Fraction(part))
     assert (picture.shape[1], picture.shape[0]) == size
 
 
@@ -144,13 +140,8 @@ class Bench:
         self._captured += 1
         times = {"captured_ns": self._captured * 1_000_000_000, "captured_ms": self._captured}
         before = self._dealt_with()
-        self.feed.put(
-            kind(
-                FrameInfo(format=form, width=64, height=48, **times),
-                frame().data if data is None else data,
-                shared=False,
-            )
-        )
+        info = FrameInfo(format=form, width=64, height=48, **times)
+        self.feed.put(kind(info, frame().data if data is None else data, shared=False))
         assert until(lambda: self._dealt_with() > before)
 
     def _dealt_with(self) -> int:
@@ -189,7 +180,7 @@ def test_after_a_bad_frame_comes_a_full_picture(
     assert [picture is not None and picture.keyframe for picture in pictures][2]
 
 
-@pytest.mark.parametrize(("level", "black"), [(0, True), (12, True), (60, False)])
+@pytest.mark.parametrize(("level", "black"), [(12, True), (60, False)])
 def test_pictures_that_are_only_black_are_a_problem(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, level: int, black: bool
 ) -> None:
