@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -9,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from pebble.extensions.media.child import tied_to_parent
+from pebble.extensions.media.child import Child, tied_to_parent
 from tests.support import ROOT, gone, until
 
 PARENT = """
 import signal, subprocess, sys, time
-from pebble.extensions.media.child import tied_to_parent
+from pebble.extensions.media.child import Child, tied_to_parent
 child = subprocess.Popen(tied_to_parent([sys.executable, "-c", "import time; time.sleep(100)"], signal.SIGTERM))
 print(child.pid, flush=True)
 time.sleep(100)
@@ -32,6 +33,13 @@ def test_a_child_goes_when_its_parent_is_killed() -> None:
         parent.send_signal(signal.SIGKILL)
         parent.wait(10)
     assert until(lambda: gone(child))
+
+
+def test_what_a_program_leaves_behind_ends_with_it() -> None:
+    program = Child(["sh", "-c", "sleep 60 & echo $!"], dict(os.environ), stdout=subprocess.PIPE)
+    left = int(program.pipe("stdout").readline())
+    assert program.wait() == 0
+    assert until(lambda: gone(left))
 
 
 def test_a_program_that_is_not_there_is_named_before_anything_starts() -> None:

@@ -3,15 +3,13 @@
 A packet that is well-formed and lies (another id, another picture, a damaged bare JPEG) cannot be told from an honest
 one: what is shown from there to the next honest key frame is not judged. Everything else is.
 
-``make test THOROUGH=1`` tries 100,000; PEBBLE_HOSTILE_SEED makes them others.
+``make test THOROUGH=1`` tries 100,000.
 """
 
 from __future__ import annotations
 
-import os
 import random
 import zlib
-from collections import Counter
 from collections.abc import Callable
 
 import cv2
@@ -24,12 +22,11 @@ from pebble.extensions.media.packets import Picture, PictureKind
 from pebble.extensions.media.video import make_encoder
 from tests.support import cases
 
-PACKETS = cases(4000, 100_000)
-SEED = int(os.environ.get("PEBBLE_HOSTILE_SEED", "1"))
+PACKETS = cases(2000, 100_000)
 T0 = 1_710_969_600_000
 HEADER = 19
 LENGTH, INTERVAL = 40, 6
-BOMB = Picture(PictureKind.ZLIB_JPEG, 0, T0, zlib.compress(bytes(30 << 20), 9)).pack()
+BOMB = Picture(PictureKind.ZLIB_JPEG, 0, T0, zlib.compress(bytes(30 << 20), 1)).pack()
 Stream = list[bytes]
 
 
@@ -56,8 +53,8 @@ def streams() -> dict[str, list[Stream]]:
 class Attack:
     """Feeds one decoder, and knows what each honest packet has to become."""
 
-    def __init__(self, seed: int) -> None:
-        self.random = random.Random(seed)
+    def __init__(self) -> None:
+        self.random = random.Random(1)
         self.streams = streams()
         self.truth: dict[bytes, Pixels] = {}
         for form in self.streams.values():
@@ -70,7 +67,7 @@ class Attack:
         self.decoder = VideoDecoder()
         self.fed = 0
         self.lied = False  # something unverifiable was shown, and no honest key frame since
-        self.seen: Counter[str] = Counter()
+        self.honestly_shown = 0
         self.form = "json"
         self.sender = self.at = 0
 
@@ -108,14 +105,14 @@ class Attack:
         )
         made = kind(packet)
         strict = kind in (self.cut, self.longer, self.garbage, self.bomb) or (kind == self.flip and checked)
-        self.feed(made, packet if strict else None, kind.__name__)
+        self.feed(made, packet if strict else None)
         self.at += self.random.random() < 0.5  # instead of the honest one, or before it
 
-    def feed(self, packet: bytes, right: bytes | None, kind: str = "honest") -> None:
+    def feed(self, packet: bytes, right: bytes | None) -> None:
         """``right``: the honest packet whose picture this may show; None: that is unknown."""
         shown = self.decoder.feed(packet)
         self.fed += 1
-        self.seen[f"{kind}: {'shown' if shown else 'hidden'}"] += 1
+        self.honestly_shown += shown is not None and packet == right
         right = packet if packet in self.truth else right
         if shown is not None:
             self._judge(shown, right)
@@ -180,12 +177,11 @@ class Attack:
 
 
 def test_hostile_packets() -> None:
-    attack = Attack(SEED)
+    attack = Attack()
     while attack.fed < PACKETS:
         attack.step()
     attack.form, attack.sender, attack.at = "pbvd", 0, 0
     for _ in range(LENGTH):  # and afterwards it works as if nothing had been
         attack.honest()
     assert attack.decoder.feed(attack.stream[0]) is not None
-    assert attack.seen["honest: shown"] > PACKETS / 5
-    print(dict(sorted(attack.seen.items())))  # noqa: T201
+    assert attack.honestly_shown > PACKETS / 5

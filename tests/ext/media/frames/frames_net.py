@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
-import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from pebble.transports.segments import SHM
 from tests.ext.media.frames.frames_peer import Options
 from tests.support import until
 from tests.transports.forked import Forked
@@ -46,9 +43,6 @@ class Peer:
     def has(self, **least: int) -> dict[str, Any]:
         """Ask until every number is at least as given."""
         return self.reaches(lambda answer: all(answer.get(name, 0) >= number for name, number in least.items()))
-
-    def signal(self, number: int) -> None:
-        os.kill(self._process.pid, number)
 
     @property
     def pid(self) -> int:
@@ -86,7 +80,6 @@ class FramesNet:
         self.folder = folder
         folder.mkdir(mode=0o700, exist_ok=True)
         self._peers: list[Peer] = []
-        self.segments: set[str] = set()  # every segment a peer was seen with
 
     def writer(self, **options: Any) -> Peer:
         return self._start("writer", Options(**options))
@@ -99,18 +92,7 @@ class FramesNet:
         self._peers.append(peer)
         return peer
 
-    def note_segments(self) -> None:
-        for peer in self._peers:
-            if peer.running:
-                maps = Path(f"/proc/{peer.pid}/maps").read_text().splitlines()
-                self.segments |= {line.split()[5] for line in maps if ".zenoh" in line}
-
-    def left(self) -> set[str]:
-        """Those of our segments that are still in shared memory."""
-        return {name for name in self.segments if (SHM / Path(name).name).exists()}
-
     def close(self) -> None:
         for peer in self._peers:
             if peer.running:
-                peer.signal(signal.SIGCONT)
                 peer.kill()

@@ -30,10 +30,8 @@ class Options(msgspec.Struct, kw_only=True):
     rate: float = 100.0  # Hz
     limit: int = 0  # frames; 0: until it is ended
     slots: int = 6
-    born: bool = True  # frames are born in the segment, if that works; else copied into it
     views: bool = False
     depth: int = 1
-    work_s: float = 0.0  # how long a reader looks at a frame
     memlock: int | None = None  # RLIMIT_MEMLOCK, bytes, as the user below
     user: int | None = None  # become this user, which takes root
 
@@ -98,7 +96,7 @@ class Writer:
                 due = time.monotonic()
 
     def _write(self, number: int) -> bool:
-        slot = self._writer.slot(self._options.size) if self._options.born else None
+        slot = self._writer.slot(self._options.size)
         array = self._frame if slot is None else slot.array
         stamp(array, number)
         info = FrameInfo(captured_ns=time.monotonic_ns(), format=FORMAT, width=self._options.size // 3, height=1)
@@ -131,8 +129,6 @@ class Reader:
             self._check(frame)
 
     def _check(self, frame: Frame) -> None:
-        if self._options.work_s:
-            time.sleep(self._options.work_s)
         good = intact(frame.data)
         if not frame.valid():
             self.invalid += 1

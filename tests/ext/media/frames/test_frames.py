@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -23,9 +22,10 @@ from pebble.extensions.media.frames.frame import encode
 from pebble.extensions.media.frames.session import METADATA, StreamNames, open_writing
 from pebble.transports import segments
 from pebble.transports.peers import prepare_run_dir
+from pebble.transports.segments import SHM
 from tests.ext.media.frames.frames_net import FramesNet
 from tests.locking import needs_shared_memory
-from tests.support import THOROUGH, needs_root, some, until
+from tests.support import THOROUGH, needs_root, until
 
 SMALL = 160 * 120 * 3  # to be shared all the same
 VGA = 640 * 480 * 3 if THOROUGH else SMALL
@@ -42,17 +42,13 @@ def net(tmp_path: Path) -> Iterator[FramesNet]:
     net.close()
 
 
-SHOWN = 60  # frames, of which readers that a busy machine holds up need not see all
+SHOWN = 40  # frames, of which readers that a busy machine holds up need not see all
 
 
-@pytest.mark.parametrize(("born", "views"), some([(True, True), (False, True), (True, False), (False, False)], 3))
-def test_every_reader_gets_whole_frames_through_shared_memory(net: FramesNet, born: bool, views: bool) -> None:
-    """Each of them: a frame is sent as bytes only when all slots are in use, and here each frame has one of its own.
-
-    Of six slots three readers that stand still hold all: one that each looks at, and one that waits for it.
-    """
-    readers = [net.reader(views=views, depth=SHOWN) for _ in range(3)]
-    writer = net.writer(size=SMALL, rate=60, born=born, limit=SHOWN, slots=SHOWN + 2)
+def test_every_reader_gets_whole_frames_through_shared_memory(net: FramesNet) -> None:
+    """Each of them: a frame is sent as bytes only when all slots are in use, and here each frame has one of its own."""
+    readers = [net.reader(views=True, depth=SHOWN) for _ in range(3)]
+    writer = net.writer(size=SMALL, rate=60, limit=SHOWN, slots=SHOWN + 2)
     for reader in readers:
         seen = reader.has(shared=20)
         assert (seen["wrong"], seen["backwards"], seen.get("copied", 0)) == (0, 0, 0)
@@ -62,21 +58,27 @@ def test_every_reader_gets_whole_frames_through_shared_memory(net: FramesNet, bo
     assert [reader.close() for reader in readers] == [0, 0, 0]
 
 
-def test_a_slow_reader_gets_the_newest(net: FramesNet) -> None:
-    writer = net.writer(rate=200)
-    reader = net.reader(work_s=0.1)
-    seen = reader.has(frames=5, skipped=20)
-    assert seen["backwards"] == 0
-    assert writer.ask()["written"] - seen["last"] < 100  # half a second, generously
+def test_a_slow_reader_gets_the_newest(tmp_path: Path) -> None:
+    with FrameWriter(tmp_path, "camera", capacity=60_000) as writer, FrameReader(tmp_path, "camera") as reader:
+        assert until(lambda: writer.wanted)
+        for number in range(10):
+            assert writer.write(bytes([number]) * 60_000, FrameInfo())
+        assert until(lambda: reader.counters["skipped"] == 9)
+        frame = reader.read(5)
+        assert frame is not None
+        assert frame.data[0] == 9
 
 
-def test_a_deep_reader_gets_them_all_in_order_and_small_frames_travel_as_bytes(net: FramesNet) -> None:
-    reader = net.reader(depth=100)
-    writer = net.writer(rate=200, limit=100, size=640)
-    seen = reader.has(frames=100, copied=100)
-    assert (seen.get("skipped", 0), seen.get("missed", 0), seen["backwards"], seen["problem"]) == (0, 0, 0, "")
-    printed = writer.ask()
-    assert (printed["sharing"], printed["problem"], printed.get("fallbacks", 0)) == (False, "", 0)
+def test_a_deep_reader_gets_them_all_in_order_and_small_frames_travel_as_bytes(tmp_path: Path) -> None:
+    with FrameWriter(tmp_path, "camera", capacity=640) as writer, FrameReader(tmp_path, "camera", depth=100) as reader:
+        assert until(lambda: writer.wanted)
+        for number in range(100):
+            assert writer.write(bytes([number]) * 640, FrameInfo())
+        frames = [reader.read(5) for _ in range(100)]
+        assert [frame is not None and (frame.data[0], frame.shared) for frame in frames] == [
+            (number, False) for number in range(100)
+        ]
+        assert (reader.problem, writer.shared, writer.problem, writer.counters["fallbacks"]) == ("", False, "", 0)
 
 
 def test_a_writer_sends_nothing_without_readers(net: FramesNet) -> None:
@@ -89,8 +91,7 @@ def test_a_writer_sends_nothing_without_readers(net: FramesNet) -> None:
     writer.reaches(lambda printed: not printed["wanted"])
 
 
-@pytest.mark.parametrize("how", ["kill", "close"])
-def test_living_readers_find_a_restarted_writer_within_a_second(net: FramesNet, how: str) -> None:
+def test_living_readers_find_a_restarted_writer_within_a_second(net: FramesNet) -> None:
     readers = [net.reader(), net.reader(views=True)]
     for life in (1, 2):
         writer = net.writer(size=VGA)
@@ -98,7 +99,7 @@ def test_living_readers_find_a_restarted_writer_within_a_second(net: FramesNet, 
             before = reader.ask().get("frames", 0)
             reader.reaches(lambda seen, before=before: seen["frames"] > before, 3)
             assert reader.ask()["writers"] == life
-        getattr(writer, how)()
+        writer.kill()
 
 
 def test_there_is_one_writer_at_a_time(tmp_path: Path) -> None:
@@ -109,24 +110,6 @@ def test_there_is_one_writer_at_a_time(tmp_path: Path) -> None:
             pass
     with FrameWriter(tmp_path, "camera", capacity=1000):
         pass
-
-
-@pytest.mark.alone
-def test_a_stopped_reader_does_not_starve_the_others(net: FramesNet) -> None:
-    writer = net.writer(size=VGA, rate=60)
-    stopped, other = net.reader(views=True), net.reader(views=True)
-    stopped.has(frames=5)
-    other.has(frames=5)
-    stopped.signal(signal.SIGSTOP)
-    printed = writer.has(fallbacks=1, reclaimed=1)
-    before = other.ask()
-    seen = other.has(frames=before["frames"] + 100)
-    assert seen.get("missed", 0) + seen.get("torn", 0) + seen["invalid"] <= 0.2 * seen["last"]
-    assert seen["wrong"] == 0
-    stopped.signal(signal.SIGCONT)
-    back = stopped.ask()
-    assert stopped.has(frames=back["frames"] + 20)["wrong"] == 0
-    assert printed["readers"] >= 1
 
 
 @pytest.fixture
@@ -208,15 +191,7 @@ def test_a_writer_knows_when_its_memory_was_removed(tmp_path: Path) -> None:
 
 
 @needs_root
-@pytest.mark.parametrize(
-    ("at_first", "then"),
-    [
-        ("size=1m", "mount -o remount,size=64m /dev/shm"),
-        ("size=64m,ro", "mount -o remount,rw /dev/shm"),
-        ("size=64m", "rm /dev/shm/others"),
-    ],
-)
-def test_frames_are_shared_once_there_is_room(tmp_path: Path, at_first: str, then: str) -> None:
+def test_frames_are_shared_once_there_is_room(tmp_path: Path) -> None:
     """The writer is opened again for it, as av_daemon is; a reader that had no room either finds it by itself."""
     program = (
         "import subprocess, sys, time; from pathlib import Path; from pebble.extensions.media.frames import *\n"
@@ -230,9 +205,9 @@ def test_frames_are_shared_once_there_is_room(tmp_path: Path, at_first: str, the
         "        w.write(b'x' * 900_000, FrameInfo()); frame = r.read(0.2) or frame\n"
         "    print(before, w.problem, r.problem, frame and frame.shared, w.may_share); w.close()"
     )
-    mount = f"mount -t tmpfs -o {at_first} none /dev/shm && (dd if=/dev/zero of=/dev/shm/others bs=1M || true)"
+    mount = "mount -t tmpfs -o size=64m none /dev/shm && (dd if=/dev/zero of=/dev/shm/others bs=1M || true)"
     command = ["unshare", "-m", "sh", "-c", mount + ' 2>/dev/null; exec "$@"', "sh", sys.executable, "-c", program]
-    printed = subprocess.check_output([*command, str(tmp_path), then], timeout=40, text=True)
+    printed = subprocess.check_output([*command, str(tmp_path), "rm /dev/shm/others"], timeout=40, text=True)
     assert printed == "(False, False)   True False\n"
 
 
@@ -333,11 +308,12 @@ def test_a_reader_may_choose_bytes_and_then_maps_nothing(tmp_path: Path) -> None
 def test_segments_of_killed_processes_are_swept(net: FramesNet) -> None:
     reader, writer = net.reader(views=True), net.writer(size=VGA)
     reader.has(frames=5)
-    net.note_segments()
-    assert len(net.left()) >= 2
+    maps = [line for peer in (reader, writer) for line in Path(f"/proc/{peer.pid}/maps").read_text().splitlines()]
+    used = {SHM / Path(line.split()[5]).name for line in maps if ".zenoh" in line}
+    assert len(used) >= 2
     writer.kill()
     reader.kill()
-    assert until(lambda: segments.sweep() >= 0 and not net.left(), 5)
+    assert until(lambda: segments.sweep() >= 0 and not any(path.exists() for path in used), 5)
 
 
 def test_the_name_of_a_stream_is_part_of_a_path(tmp_path: Path) -> None:

@@ -77,7 +77,6 @@ def _unprintable(buffer: object) -> int:
 
 MISMATCHES = {
     "another version": ("KNOWN_VERSIONS", frozenset({"1.9.0"}), "1.9.0"),
-    "no version": ("zenoh_version", lambda: "", "unknown version"),
     "the address is nowhere": ("_printed", lambda _: 1, "none of its words"),
     "nothing is printed": ("_printed", _unprintable, "does not print"),
     "it is a word further": ("_only", lambda found: min(found[0]) + 8, "has moved"),
