@@ -148,7 +148,7 @@ def test_what_cannot_be_read_is_named_and_not_touched(tmp_path: Path, run: Run, 
     path = stored(tmp_path, data)
     unread = [line for day in Days(Archive(tmp_path / "rec")).all() for line in day.unread]
     assert any(wanted in line for line in unread) == (name not in IN_CHUNKS)
-    each = cases(3, 1)  # of the commands, for a damage others than for the next one
+    each = cases(4, 1)  # of the commands, for a damage others than for the next one
     for number, command in enumerate([*READERS, *WRITERS][[*DAMAGED].index(name) % each :: each]):
         code = run(*on(tmp_path / "rec", command, tmp_path / str(number)))
         assert (code, NAME in run.err, wanted in run.err) == (1, True, True), (command, run.out, run.err)
@@ -163,7 +163,7 @@ def test_a_flipped_bit_anywhere_costs_no_message_at_a_deletion(tmp_path: Path) -
     data, chance = path.read_bytes(), random.Random(1)
     expected = [one for one in contents(path) if "/r0/" not in one[0]]
     refused = 0
-    for at in range(chance.randrange(7), len(data), cases(17, 7)):
+    for at in range(chance.randrange(7), len(data), cases(41, 7)):
         raw = flipped(data, at, chance.randrange(8))
         path.write_bytes(raw)
         try:
@@ -173,19 +173,15 @@ def test_a_flipped_bit_anywhere_costs_no_message_at_a_deletion(tmp_path: Path) -
             refused += 1
         else:
             assert contents(path) == expected, at
-    assert refused > 20
+    assert refused > 8
 
 
-@pytest.mark.parametrize("command", [READERS[2], WRITERS[0]], ids=["search", "rm"])
-def test_without_the_package_the_extra_is_named(
-    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch, command: list[str]
-) -> None:
+def test_without_the_package_the_extra_is_named(tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     path = stored(tmp_path, by_package())
     monkeypatch.setattr("pebble.extensions.recordings.files.recorded.find_spec", lambda _: None)
-    assert run(*on(tmp_path / "rec", command, tmp_path / "out")) == 1
+    assert run(*on(tmp_path / "rec", WRITERS[0], tmp_path / "out")) == 1
     assert 'recordings need the package mcap: pip install "pebble-robot[record]"' in run.err
     assert path.read_bytes() == by_package()
-    assert not [one for one in tmp_path.glob("out*") if one.is_file()]
 
 
 def _full(_descriptor: int) -> None:
@@ -264,8 +260,7 @@ class TestNames:
         assert contents(path) == written
         assert run("recordings", "rm", path, "--yes") == 1
 
-    @pytest.mark.parametrize("command", [("rm", "notes.txt", "--yes"), ("rm", "none.mcap", "--yes"),
-                                         ("export", NAME, NAME), ("mend", NAME, NAME)])  # fmt: skip
+    @pytest.mark.parametrize("command", [("rm", "notes.txt", "--yes"), ("export", NAME, NAME), ("mend", NAME, NAME)])
     def test_no_other_file_is_deleted_or_replaced(self, tmp_path: Path, run: Run, command: tuple[str, ...]) -> None:
         path = stored(tmp_path, VALID["zstd"])
         path.with_name("notes.txt").write_text("notes")
@@ -308,7 +303,7 @@ class TestMending:
         data = path.read_bytes()
         with RecordingFile(path) as file:
             last = file.chunks[-1]
-        for end in range(last.at, len(data), 97):
+        for end in range(last.at, len(data), 301):
             path.write_bytes(data[:end])
             assert run("recordings", "mend", tmp_path / "rec") == 0
             rest = contents(path.with_name(NAME))

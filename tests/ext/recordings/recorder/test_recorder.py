@@ -6,7 +6,6 @@ import errno
 import json
 import os
 import random
-import shutil
 import subprocess
 import sys
 import threading
@@ -31,7 +30,7 @@ from pebble.extensions.recordings.recorder.lane import Item, OpenFile, RawFile
 from pebble.extensions.recordings.recorder.recorder import Recorder
 from pebble.extensions.recordings.recorder.settings import Options
 from tests.small_disk import SmallDisk
-from tests.support import beside, cases, needs_root, until
+from tests.support import ROOT, beside, cases, needs_root, until
 
 BASE = "pebble/robots/goob"
 ONLINE, CAMERA = f"{BASE}/outgoing/online", f"{BASE}/outgoing/front-camera"
@@ -143,21 +142,22 @@ class TestFiles:
         """However long the disk holds up the writer, and whatever happens to the recording meanwhile."""
         monkeypatch.setattr(RawFile, "write", _slowly(RawFile.write, 0.4))
         running = Running(tmp_path / "rec")
-        for _ in range(60):
+        for _ in range(25):
             running.send(payload=b'{"t":%d}' % (time.time_ns() // 10**6))
             running.recorder.note("connected")
             time.sleep(0.02)
         running.stop()
         online = [message for message in recorded(running.root) if message.channel.topic == ONLINE]
-        assert len(online) == 60
+        assert len(online) == 25
         assert max(abs(message.log_ns - message.publish_ns) for message in online) < 100e6
 
-    @pytest.mark.parametrize("retain", [False, None])
-    def test_carried_values_are_those_of_each_broker_and_the_newest(self, tmp_path: Path, retain: bool | None) -> None:
+    def test_files_are_rotated_and_carry_the_newest_value_of_each_broker(self, tmp_path: Path) -> None:
         running = Running(tmp_path / "rec", Options(free_bytes=0, rotate_seconds=0.5))
-        flag, receive = f"{BASE}/incoming/flags/mqtt-video", running.recorder.receive
+        flag, gone, receive = f"{BASE}/incoming/flags/mqtt-video", f"{BASE}/outgoing/gone", running.recorder.receive
         receive(flag, b"true", None, True, retained=True)
-        receive(flag, b"false", 1, retain)
+        receive(flag, b"false", 1, None)
+        receive(gone, b"1", 1, True)
+        receive(gone, b"", 1, True)
         receive(ONLINE, b"one", 1, True, source="one")
         receive(ONLINE, b"two", 1, True, source="two")
         receive(STATUS, b"gone", None, True, retained=True, source="two")
@@ -165,10 +165,14 @@ class TestFiles:
         receive(ONLINE, b"three", None, True, retained=True, source="two")
         receive(STATUS, b"newer", 1, True, source="one")
         receive(STATUS, b"older", None, True, retained=True, source="one")  # fetched meanwhile by another connection
-        time.sleep(1.5)
+        for _ in range(30):
+            running.send(topic=f"{BASE}/outgoing/live")
+            time.sleep(0.05)
         running.stop()
+        assert len(library.files([running.root])) >= 2
         carried = {m.payload for m in recorded(running.root) if m.channel.metadata.get("retained") == "carried"}
-        assert carried == {b"false" if retain is None else b"true", b"one", b"three", b"newer"}
+        assert carried == {b"false", b"one", b"three", b"newer"}
+        assert payloads(running.root, f"{BASE}/outgoing/live") == [b"%d" % number for number in range(30)]
 
     def test_no_media(self, tmp_path: Path) -> None:
         running = Running(tmp_path / "rec", Options(free_bytes=0, media=False))
@@ -177,25 +181,7 @@ class TestFiles:
         running.stop()
         assert [path.name.split(".")[1] for path in library.files([tmp_path])] == ["state"]
 
-    def test_files_are_rotated_and_the_next_begins_with_the_retained_values(self, tmp_path: Path) -> None:
-        running = Running(tmp_path / "rec", Options(free_bytes=0, rotate_seconds=1.0))
-        running.send(topic=f"{BASE}/outgoing/status", payload=b'{"a": 1}', retain=True)
-        running.send(topic=f"{BASE}/outgoing/gone", payload=b"1", retain=True)
-        running.send(topic=f"{BASE}/outgoing/gone", payload=b"", retain=True)
-        for _ in range(30):
-            running.send()
-            time.sleep(0.05)
-        running.stop()
-        files = library.files([running.root])
-        assert len(files) >= 2
-        with RecordingFile(files[-1]) as file:
-            assert file.metadata()["pebble.recording"]["lane"] == "state"
-        again = [m for m in library.merged(files[1:2]) if m.channel.metadata.get("retained") == "carried"]
-        assert [message.payload for message in again] == [b'{"a": 1}']
-        live = [m.payload for m in recorded(running.root) if m.channel.topic == ONLINE]
-        assert live == [b"%d" % number for number in range(3, 33)]
-
-    @pytest.mark.parametrize(("limit", "most"), [("_MOST_CHANNELS", 1000), ("_MOST_INDEXED", 5)])
+    @pytest.mark.parametrize(("limit", "most"), [("_MOST_CHANNELS", 500), ("_MOST_INDEXED", 5)])
     def test_a_stranger_may_invent_topics(
         self, running: Running, monkeypatch: pytest.MonkeyPatch, limit: str, most: int
     ) -> None:
@@ -203,14 +189,14 @@ class TestFiles:
         monkeypatch.setattr(lane, limit, most)
         running.send()
         assert running.written(1)
-        for number in range(6000):
+        for number in range(2000):
             running.recorder.receive(f"pebble/robots/evil{number % 7}/outgoing/{number}", b"%d" % number, 0, False)
-        assert running.written(6001)
+        assert running.written(2001)
         running.send()
         running.stop()
         found = recorded(running.root)
         evil = {message.channel.topic: message.payload for message in found if "evil" in message.channel.topic}
-        assert len(evil) == 6000
+        assert len(evil) == 2000
         assert all(topic.endswith(payload.decode()) for topic, payload in evil.items())
         assert len(payloads(running.root)) == 2
         assert len(library.files([running.root])) >= 2
@@ -230,14 +216,6 @@ class TestFiles:
 
 
 @contextmanager
-def _removed(disk: SmallDisk) -> Iterator[None]:
-    (disk.root / "rec").rename(disk.root / "away")
-    yield
-    shutil.rmtree(disk.root / "rec")
-    (disk.root / "away").rename(disk.root / "rec")
-
-
-@contextmanager
 def _unmounted(disk: SmallDisk) -> Iterator[None]:
     """Something else is mounted over it meanwhile."""
     disk.mount()
@@ -248,7 +226,6 @@ def _unmounted(disk: SmallDisk) -> Iterator[None]:
 #: What happens to the disk, and what the log says.
 FAULTS: dict[str, tuple[Callable[[SmallDisk], AbstractContextManager[None]], str]] = {
     "unmounted": (_unmounted, "was removed, or is on another disk now"),
-    "removed": (_removed, "was removed, or is on another disk now"),
     "full": (SmallDisk.full, "the disk is full: nothing is recorded until that is mended"),
 }
 
@@ -257,28 +234,28 @@ class TestDisk:
     def test_a_slow_disk_blocks_no_sender_and_costs_pictures_first(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(RawFile, "write", _slowly(RawFile.write, 0.7))
-        monkeypatch.setattr(recorders, "QUEUE_BYTES", 600_000)
+        monkeypatch.setattr(RawFile, "write", _slowly(RawFile.write, 0.3))
+        monkeypatch.setattr(recorders, "QUEUE_BYTES", 300_000)
         running = Running(tmp_path / "rec")
         running.send()
         assert until(lambda: running.recorder.waiting == 0, 10)
         began = time.monotonic()
-        for _ in range(300):
+        for _ in range(150):
             running.send(topic=CAMERA, payload=PICTURE + bytes(5000))
             running.send()
         assert time.monotonic() - began < 1.0
         assert until(lambda: running.recorder.counters["event_dropped"], 10)
         written = running.recorder.counters["written"]
         running.send()
-        assert running.written(written + 300)  # the others of the queue, and then once more
+        assert running.written(written + 150)  # the others of the queue, and then once more
         dropped = running.recorder.counters["dropped"]
         running.stop()
-        assert dropped > 100
-        assert len(payloads(running.root)) == 302
+        assert dropped > 50
+        assert len(payloads(running.root)) == 152
         assert sum(event["messages"] for event in events(running.root, "dropped")) == dropped
 
     def test_a_full_disk_loses_only_what_comes_meanwhile_and_the_count_is_written_down(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         full, write = threading.Event(), RawFile.write
 
@@ -308,31 +285,25 @@ class TestDisk:
         gap = events(running.root, "gap")
         assert [event["messages"] for event in gap] == [70]
         assert [len(events(running.root, name)) for name in ("recovered", "lost")] == [1, 1]
-        assert [
-            record.getMessage() for record in caplog.records if record.name.startswith("pebble.extensions.recordings")
-        ] == [
-            "the disk is full: nothing is recorded until that is mended",
-            "recording again",
-        ]
 
     def test_the_oldest_media_go_first_and_what_is_not_ours_stays(self, tmp_path: Path) -> None:
         root = tmp_path / "rec"
         foreign = root / "2026" / "mine.mcap"
         foreign.parent.mkdir(parents=True)
         foreign.write_bytes(bytes(100_000))
-        options = Options(free_bytes=0, rotate_seconds=0.4, keep_bytes=60_000)
+        options = Options(free_bytes=0, rotate_seconds=0.4, keep_bytes=30_000)
         running, rng = Running(root, options), random.Random(1)
-        for _ in range(60):
+        for _ in range(30):
             running.send(topic=CAMERA, payload=PICTURE + rng.randbytes(3000))
             running.send()
             time.sleep(0.05)
         running.stop()
         entries = Folder(root).entries()
         assert foreign.exists()
-        assert sum(entry.size for entry in entries) < 60_000 + 60_000
+        assert sum(entry.size for entry in entries) < 30_000 + 60_000
         assert len(events(root, "pruned")) >= 2
         assert all("media" in event["file"] for event in events(root, "pruned")[:2])
-        assert len(payloads(root)) == 60
+        assert len(payloads(root)) == 30
 
     def test_files_that_are_too_old_go_one_in_a_minute(self, tmp_path: Path) -> None:
         """The clock may have been set wrong."""
@@ -446,7 +417,7 @@ def _slowly(write: Any, seconds: float) -> Any:
 
 
 class TestClock:
-    @pytest.mark.parametrize("by_s", [-3600.0, 3600.0, 40 * 86_400.0])
+    @pytest.mark.parametrize("by_s", [-3600.0, 40 * 86_400.0])
     def test_a_jump_begins_a_new_file_and_time_never_goes_back_in_one(self, tmp_path: Path, by_s: float) -> None:
         shift = [0]
         running = Running(tmp_path / "rec", clocks=Clocks(wall_ns=lambda: time.time_ns() + shift[0]))
@@ -541,3 +512,25 @@ class TestEnds:
         assert running.written(20)
         (path,) = running.root.rglob("*.active")
         assert until(lambda: synced[-1:] == [path.stat().st_size], 10)
+
+
+# A last block that lives keeps all pages below it, which hold nothing, at the process.
+_MEMORY = """
+import os
+from tests.own_memory import own_mb
+from pebble.extensions.recordings.recorder.background import return_free_pages
+
+blocks = [bytes(2000) for _ in range(20_000)]
+last = blocks.pop()
+del blocks
+before = own_mb(os.getpid())
+return_free_pages()
+print(before - own_mb(os.getpid()))
+"""
+
+
+@pytest.mark.skipif("CS_GNU_LIBC_VERSION" not in os.confstr_names, reason="needs glibc")
+def test_free_pages_are_returned() -> None:
+    command = [sys.executable, "-c", _MEMORY]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=30)
+    assert float(done.stdout) > 30

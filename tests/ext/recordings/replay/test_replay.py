@@ -175,7 +175,6 @@ def test_a_broker_that_restarts_gets_the_rest(tmp_path: Path, run: Run) -> None:
     ("arguments", "problem"),
     [
         (("--incoming", "--speed", "0.5"), "--speed 0.5 would drive a robot for longer"),
-        (("--base", "pebble"), "--base pebble is the base of pebble/robots/goob itself"),
         (("--only", "other/#"), "no topic other/# in "),
         (("--only", "+/+/+/incoming/#"), "there is nothing to publish"),
         ((), "cannot connect"),
@@ -197,7 +196,6 @@ def test_what_damage_has_taken_is_counted(tmp_path: Path, at: tuple[str, str], r
     assert rewrite(path, mended).missing == 100
     assert run("replay", mended, *at, "--speed", "100") == 0
     assert run.err == "pebble: 100 messages are missing in this recording: files were damaged\n"
-    assert run.out.splitlines()[-1] == "300 sent, 0 skipped"
     assert run("replay", path, *at, "--speed", "100") == 1
     assert "1 damaged parts, 100 messages missing" in run.err
     assert run.out.splitlines()[-1] == "300 sent, 0 skipped"

