@@ -54,12 +54,6 @@ def test_speed_may_change_meanwhile(walk: Path) -> None:
     assert stage.sent[-1].at == pytest.approx(10.5 + 4.85, abs=0.01)
 
 
-def test_stamps_are_as_old_as_they_were(walk: Path) -> None:
-    stage = Stage(walk, Options(), speed=2.0).run()
-    for sent in stage.sent:
-        assert stamp_ns(sent.message.payload) == pytest.approx(NOW_NS + sent.at * 1e9, abs=2e6)
-
-
 @pytest.mark.parametrize(("paused", "number", "begins"), [(False, 11, 100.5), (True, 0, 100)])
 def test_a_pause_takes_no_time_of_the_recording(walk: Path, paused: bool, number: int, begins: float) -> None:
     stage = Stage(walk, ALL, paused=paused)

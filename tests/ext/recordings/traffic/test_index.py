@@ -91,12 +91,6 @@ def test_a_robot_may_have_any_name_and_what_belongs_to_none_keeps_its_topic(tmp_
     assert sources([tmp_path], tmp_path / "scratch").robots == sorted(robots)
 
 
-def test_times_beyond_what_a_timestamp_holds_are_left_out(tmp_path):
-    indexed(tmp_path, [Sent(START_NS, f"{GOOB}/outgoing/status", b"{}"), Sent(1 << 63, f"{GOOB}/outgoing/status", b"")])
-    assert rows(tmp_path, "epoch_ns(ts)") == [(START_NS,)]
-    assert sources([tmp_path], tmp_path / "scratch").missing == 1
-
-
 def state(folder: Path) -> list[tuple[Path, int]]:
     return [(path, path.stat().st_mtime_ns) for path in sorted(folder.rglob("*.parquet"))]
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import re
 import statistics
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
@@ -15,26 +17,28 @@ from pebble.extensions.media.packets import Codec, Picture, PictureKind, Sound
 from pebble.extensions.recordings.files.recorded import Recorded
 from pebble.extensions.recordings.library import merged
 from pebble.extensions.recordings.traffic.analysis import analyse
+from pebble.extensions.recordings.traffic.report import remarks, write_report
 from pebble.extensions.recordings.traffic.results import (
     ALL,
     AUDIO,
     COMPONENT,
     HEARTBEATS,
     IDLE,
-    LINUX,
-    MCU,
     SESSION,
     TOTAL,
     VIDEO,
     VOICE,
+    Gap,
     RobotTraffic,
     Traffic,
 )
 from pebble.extensions.recordings.traffic.sources import sources
-from tests.ext.recordings.demo_robots import BENJR, DRIVE, FRED, GOOB, MEDIA, MINILAMP
+from pebble.extensions.recordings.traffic.tables import tables, write_csv
+from tests.ext.recordings.demo_robots import BENJR, DRIVE, FRED, GOOB, MEDIA
 from tests.ext.recordings.synthetic import START_NS, Sent, demo_folder, event, write_recording
 
 pytest.importorskip("duckdb")
+pytest.importorskip("matplotlib")
 
 SECOND, MS = 10**9, 10**6
 
@@ -99,12 +103,6 @@ def test_bandwidth_is_that_of_active_seconds(recorded, base, family, suffix):
     assert [one.median_kbps, one.p95_kbps] == pytest.approx(percentiles(expected))
 
 
-def test_pcm_takes_what_the_paper_measured(of):
-    packet = Sound(Codec.PCM16LE, 1, 16000, 320, 1, START_NS // MS, bytes(640)).pack()
-    found = of(Sent(START_NS + number * 20 * MS, f"{GOOB}/outgoing/audio", packet) for number in range(500))
-    assert robot(found, GOOB).of(AUDIO).median_kbps == 265.6
-
-
 @pytest.mark.parametrize("base", [FRED, BENJR])
 def test_intervals_outages_and_latency(recorded, base):
     heartbeats = messages_of(base, "outgoing/online")
@@ -126,19 +124,9 @@ def test_intervals_outages_and_latency(recorded, base):
 # -- what robots are like
 
 
-def test_kinds_of_robots(recorded):
-    kinds = {one.robot: one.machine for one in recorded.robots}
-    assert kinds == {GOOB: LINUX, FRED: LINUX, MINILAMP: MCU, BENJR: MCU}
-
-
 def test_a_component_without_heartbeats(of):
     found = of([Sent(START_NS, "pebble/infrastructure/mast/outgoing/charging-level", b"{}")]).robots[0]
     assert (found.machine, found.interval_ms, found.latency, found.outages) == (COMPONENT, None, None, [])
-
-
-def test_stamps_of_clocks_that_were_never_set_do_not_count(of):
-    found = of([Sent(START_NS, f"{GOOB}/outgoing/online", b'{"t": 5000}')])
-    assert robot(found, GOOB).latency is None
 
 
 # -- outages
@@ -198,11 +186,6 @@ def test_the_last_heartbeat_of_a_connection_does_not_count(of):
     assert robot(of(ordered(steady(GOOB), [will])), GOOB).latency.count == 240
 
 
-def test_both_names_of_the_heartbeat_count_once(of):
-    both = [Sent(sent.log_ns + MS, sent.topic.replace("online", "heartbeat"), sent.payload) for sent in steady(GOOB)]
-    assert robot(of(ordered(steady(GOOB), both)), GOOB).interval_ms == 250.0
-
-
 # -- sessions
 
 
@@ -252,13 +235,6 @@ def test_media_are_counted_by_what_they_are(of, metric, payload, family):
 # -- periods, places, options
 
 
-def test_a_period(of):
-    since, until = START_NS + 10 * SECOND, START_NS + 20 * SECOND
-    found = of(steady(GOOB), since_ns=since, until_ns=until)
-    assert robot(found, GOOB).messages == 40
-    assert (found.since_ns, found.until_ns) == (since, until - 250 * MS)
-
-
 def test_a_file_that_is_being_written_is_read_and_not_indexed(tmp_path):
     folder, scratch = tmp_path / "it's [1] *?", tmp_path / "scratch"  # no pattern
     write_recording(folder / "a.mcap", steady(GOOB, seconds=2.0))
@@ -278,3 +254,107 @@ def test_a_damaged_index_is_named(tmp_path):
         analyse(found, tmp_path / "scratch")
     assert "a.parquet" in str(error.value)
     assert "\n" not in str(error.value)
+
+
+# -- the report: one file that needs no other, in which no name of a robot does anything
+
+
+EVIL = "<img src=x onerror=alert(1)>"
+
+
+@pytest.fixture(scope="module")
+def written(recorded, tmp_path_factory) -> list[Path]:
+    return write_report(recorded, tmp_path_factory.mktemp("report"), csv=True)
+
+
+@pytest.fixture(scope="module")
+def page(written) -> str:
+    return written[0].read_text()
+
+
+def test_nothing_is_loaded_or_run_and_every_drawing_has_a_name(page, recorded):
+    assert re.findall(r"<(?:script|img|link|iframe|object|image)\b", page) == []
+    links = re.findall(r'(?:href|src)="([^"]*)"', page)
+    assert links
+    assert all(link.startswith("#") for link in links)
+    assert re.findall(r"https?://|url\((?!#)|@import", page) == []
+    assert "default-src 'none'" in page
+    drawings = re.findall(r"<svg\b[^>]*>", page)
+    assert len(drawings) == 3 * len(recorded.robots)
+    assert all('role="img"' in drawing and 'aria-label="' in drawing for drawing in drawings)
+
+
+def test_gaps_and_losses_stand_out(recorded):
+    recorded = Traffic(**{name: getattr(recorded, name) for name in recorded.__struct_fields__})
+    recorded.gaps, recorded.dropped, recorded.missing = [Gap(START_NS, START_NS + 10**9, "lost")], 5, 7
+    assert remarks(recorded)[0].startswith("Nothing was recorded once")
+    assert "5 messages were not recorded" in remarks(recorded)[1]
+    assert "7 were lost to damage" in remarks(recorded)[1]
+
+
+def test_names_of_robots_do_nothing(tmp_path):
+    robots = [f"pebble/robots/{name}" for name in (EVIL.replace("/", ""), "$x^2$ & 'y' \"z\"")]
+    sent = [Sent(START_NS + at * 10**8, f"{robots[at % 2]}/outgoing/online", b'{"t":1}') for at in range(60)]
+    found = analysed(tmp_path / "recordings", sent, tmp_path / "scratch")
+    page = write_report(found, tmp_path)[0].read_text()
+    assert EVIL not in page
+    assert "&lt;img" in page
+
+
+def test_csv_has_a_file_for_each_table(recorded, written):
+    assert [path.suffix for path in written] == [".html", *[".csv"] * len(tables(recorded))]
+    folder = written[0].parent
+    (row,) = csv.DictReader((folder / "table-4-1-media-bandwidth.csv").open())
+    (fred,) = (robot for robot in recorded.robots if robot.robot == row["robot"] == FRED)
+    assert float(row["audio_median_kbps"]) == pytest.approx(fred.of(AUDIO).median_kbps, abs=0.05)
+    outages = list(csv.DictReader((folder / "outages.csv").open()))
+    assert len(outages) == sum(len(robot.outages) for robot in recorded.robots)
+
+
+@pytest.mark.parametrize("name", ["=1+1", "\tx"])
+def test_a_name_is_no_formula(recorded, tmp_path, name):
+    table = tables(recorded)[1]
+    path = write_csv(type(table)("x", "", [("robot", ""), ("number", "")], [[name, -1]]), tmp_path)
+    assert path.read_bytes() == f"robot,number\r\n'{name},-1\r\n".encode()
+
+
+# -- the command
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("TZ", "UTC")
+    monkeypatch.chdir(tmp_path)
+    return demo_folder(tmp_path / "recordings")
+
+
+def test_some_robots_some_time_and_csv(run, folder, tmp_path):
+    arguments = ["--robot", "fred", "-r", "pebble/robots/benjr", "--since", "2026-11-22T23:46:05", "--until", "+5s"]
+    assert run("analyse", folder, *arguments, "--output", tmp_path / "out", "--csv") == 0
+    rows = (tmp_path / "out" / "bandwidth.csv").read_text().splitlines()
+    assert {row.split(",")[0] for row in rows[1:]} == {"pebble/robots/fred", "pebble/robots/benjr"}
+    row = next(row for row in rows if row.startswith("pebble/robots/benjr,MCU,heartbeat,all"))
+    since_ns = 1_795_391_165 * 10**9
+    heartbeats = messages_of(BENJR, "outgoing/online")
+    assert int(row.split(",")[7]) == sum(0 <= message.log_ns - since_ns < 5e9 for message in heartbeats)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["missing.mcap"], "missing.mcap: No such file or directory"),
+        (["recordings", "--since", "2030-01-01"], "no message of a robot in this period"),
+        (["recordings", "--robot", "a/b"], 'give its id, or "system/type/id"'),
+        (["recordings", "--output", "recordings/a.state.mcap"], "recordings/a.state.mcap: File exists"),
+    ],
+)
+def test_what_is_wrong_is_one_line(run, folder, arguments, message):
+    assert run("analyse", *arguments) == 1
+    assert message in run.err
+    assert len(run.err.splitlines()) == 1
+
+
+def test_packages_that_are_missing_are_named(run, folder, monkeypatch):
+    monkeypatch.setattr("pebble.extensions.recordings.traffic.duck.find_spec", lambda _name: None)
+    assert run("analyse", folder) == 1
+    assert run.err == 'pebble: duckdb and matplotlib missing: pip install "pebble-robot[archive]"\n'
