@@ -8,8 +8,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 from pebble.extensions.media.child import Child, tied_to_parent
 from tests.support import ROOT, gone, until
 
@@ -40,8 +38,3 @@ def test_what_a_program_leaves_behind_ends_with_it() -> None:
     left = int(program.pipe("stdout").readline())
     assert program.wait() == 0
     assert until(lambda: gone(left))
-
-
-def test_a_program_that_is_not_there_is_named_before_anything_starts() -> None:
-    with pytest.raises(FileNotFoundError, match="no-such-program"):
-        tied_to_parent(["no-such-program", "--help"])
