@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -23,16 +25,89 @@ from pebble.extensions.media.frames.session import METADATA, StreamNames, open_w
 from pebble.transports import segments
 from pebble.transports.peers import prepare_run_dir
 from pebble.transports.segments import SHM
-from tests.ext.media.frames.frames_net import FramesNet
+from tests.ext.media.frames.frames_peer import Options
 from tests.locking import needs_shared_memory
-from tests.support import THOROUGH, needs_root, until
+from tests.support import needs_root, until
+from tests.transports.forked import Forked
 
 SMALL = 160 * 120 * 3  # to be shared all the same
-VGA = 640 * 480 * 3 if THOROUGH else SMALL
 QVGA = 320 * 240 * 3  # a pool of these fits into the 8 MiB that users may usually lock
 UNPRIVILEGED_USER = (
     65534 if os.geteuid() == 0 else os.geteuid()
 )  # root may lock what it likes; for others the limits count
+
+
+class Peer:
+    """One process; `ask` for its numbers."""
+
+    def __init__(self, role: str, folder: Path, options: Options) -> None:
+        arguments = (role, str(folder), msgspec.json.encode(options).decode())
+        self._process = Forked("tests.ext.media.frames.frames_peer", *arguments)
+        assert self._line() == "up"
+
+    def ask(self) -> dict[str, Any]:
+        self._process.stdin.write("?\n")
+        self._process.stdin.flush()
+        answer: dict[str, Any] = json.loads(self._line())
+        return answer
+
+    def reaches(self, condition: Callable[[dict[str, Any]], object], timeout: float = 10.0) -> dict[str, Any]:
+        """Ask until ``condition`` is true for an answer, and return that."""
+        answers: list[dict[str, Any]] = [{}]
+
+        def asked() -> object:
+            answers.append(self.ask())
+            return condition(answers[-1])
+
+        assert until(asked, timeout, step=0.02), answers[-1]
+        return answers[-1]
+
+    def has(self, **least: int) -> dict[str, Any]:
+        """Ask until every number is at least as given."""
+        return self.reaches(lambda answer: all(answer.get(name, 0) >= number for name, number in least.items()))
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.wait(10)
+        for pipe in (self._process.stdin, self._process.stdout):
+            with suppress(BrokenPipeError):
+                pipe.close()
+
+    def _line(self) -> str:
+        return self._process.stdout.readline().strip()
+
+    @property
+    def running(self) -> bool:
+        return self._process.poll() is None
+
+
+class FramesNet:
+    """A run directory and its peers; `close` ends them all."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        folder.mkdir(mode=0o700, exist_ok=True)
+        self._peers: list[Peer] = []
+
+    def writer(self, **options: Any) -> Peer:
+        return self._start("writer", Options(**options))
+
+    def reader(self, **options: Any) -> Peer:
+        return self._start("reader", Options(**options))
+
+    def _start(self, role: str, options: Options) -> Peer:
+        peer = Peer(role, self.folder, options)
+        self._peers.append(peer)
+        return peer
+
+    def close(self) -> None:
+        for peer in self._peers:
+            if peer.running:
+                peer.kill()
 
 
 @pytest.fixture
@@ -78,7 +153,7 @@ def test_a_writer_sends_nothing_without_readers(net: FramesNet) -> None:
 def test_living_readers_find_a_restarted_writer_within_a_second(net: FramesNet) -> None:
     readers = [net.reader(), net.reader(views=True)]
     for life in (1, 2):
-        writer = net.writer(size=VGA)
+        writer = net.writer(size=SMALL)
         for reader in readers:
             before = reader.ask().get("frames", 0)
             reader.reaches(lambda seen, before=before: seen["frames"] > before, 3)
@@ -224,7 +299,7 @@ def test_past_a_limit_of_mapped_memory_frames_come_as_bytes_and_the_reader_repor
 ) -> None:
     monkeypatch.setattr(frame_reader, "MAPPED_LIMIT", -1)
     with FrameReader(net.folder, "camera") as reader:
-        net.writer(size=VGA, rate=60)
+        net.writer(size=SMALL, rate=60)
 
         def comes_as_bytes() -> bool:
             frame = reader.read(1)
@@ -276,7 +351,7 @@ def test_anything_with_bytes_can_be_written(tmp_path: Path) -> None:
 
 
 def test_segments_of_killed_processes_are_swept(net: FramesNet) -> None:
-    reader, writer = net.reader(views=True), net.writer(size=VGA)
+    reader, writer = net.reader(views=True), net.writer(size=SMALL)
     reader.has(frames=5)
     maps = [line for peer in (reader, writer) for line in Path(f"/proc/{peer.pid}/maps").read_text().splitlines()]
     used = {SHM / Path(line.split()[5]).name for line in maps if ".zenoh" in line}
