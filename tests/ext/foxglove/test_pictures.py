@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import re
 import signal
+import subprocess
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import av
@@ -14,7 +19,7 @@ import numpy as np
 import pytest
 
 from tests.ext.foxglove.live import Live, client, live
-from tests.ext.foxglove.watcher import Watcher
+from tests.ext.foxglove.watcher import Watcher, parser
 from tests.ext.page.media.robots import (
     AUDIO,
     CAMERA,
@@ -25,6 +30,7 @@ from tests.ext.page.media.robots import (
     SoundRobot,
     capabilities,
 )
+from tests.kit.npm import package
 from tests.kit.scene import read_counter
 from tests.support import Broker, until
 
@@ -157,3 +163,30 @@ def test_sound_becomes_samples(broker: Broker) -> None:
         assert np.abs(samples).max() > 1000
     finally:
         robot.close()
+
+
+# -- Foxglove's own client, @foxglove/ws-protocol
+
+
+def watch(address: str, topic: str, count: int) -> dict[str, Any]:
+    package("@foxglove/ws-protocol")
+    watcher = Watcher(address)
+    assert until(lambda: topic in watcher.channels)
+    watcher.close()
+    command = ["node", str(Path(__file__).with_name("client.cjs")), address, topic, str(count)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+def test_it_sees_compressed_video(broker: Broker) -> None:
+    with filming(broker) as robot, live(broker) as server:
+        found = watch(server.address, H264, 20)
+        assert until(lambda: robot.requests[-1] == WITHDRAWN, 20)
+    assert {H264, JPEG} <= set(found["topics"])
+    assert (found["info"]["name"], found["info"]["capabilities"]) == ("Pebble", [])
+    kind = parser(found["channel"])
+    videos = [kind.FromString(base64.b64decode(message["data"])) for message in found["messages"]]
+    assert {5, 7, 8} <= set(nal_types(videos[0].data))
+    assert all(abs(int(message["at"]) / 1e9 - time.time()) < 60 for message in found["messages"])

@@ -297,20 +297,6 @@ class TestMending:
         assert run("recordings", "list", tmp_path / "rec", columns=200) == 0
         assert "20 missing" in run.out
 
-    def test_the_begin_of_a_record_is_all_that_may_be_lost_with_it(self, tmp_path: Path, run: Run) -> None:
-        path = stored(tmp_path, b"", f"{NAME}.active")
-        written = write(path, 100, finish=False, each=20)
-        data = path.read_bytes()
-        with RecordingFile(path) as file:
-            last = file.chunks[-1]
-        for end in range(last.at, len(data), 301):
-            path.write_bytes(data[:end])
-            assert run("recordings", "mend", tmp_path / "rec") == 0
-            rest = contents(path.with_name(NAME))
-            assert rest == written[:80] or (end >= last.at + last.length and rest == written)
-            assert [one.name for one in path.parent.iterdir()] == [NAME]
-            path.with_name(NAME).unlink()
-
     @pytest.mark.parametrize("data", [b"", whole(library="pebble 1.0")[:-60]])
     def test_a_file_without_messages_goes(self, tmp_path: Path, run: Run, data: bytes) -> None:
         path = stored(tmp_path, data, f"{NAME}.active")

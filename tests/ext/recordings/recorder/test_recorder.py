@@ -400,13 +400,6 @@ class TestDisk:
         assert running.recorder.counters["dropped"] == 70
         assert len(payloads(running.root)) == 20
 
-    def test_no_room_from_the_start(self, tmp_path: Path) -> None:
-        running = Running(tmp_path / "rec", Options(free_bytes=1 << 60))
-        assert until(lambda: "the disk is full" in running.recorder.blocked, 10)
-        running.send(10)
-        assert until(lambda: running.recorder.counters["dropped"] == 10, 10)
-        running.stop()
-
 
 def _slowly(write: Any, seconds: float) -> Any:
     def slow(self: Any, data: memoryview) -> int | None:
