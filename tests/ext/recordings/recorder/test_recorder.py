@@ -254,36 +254,44 @@ class TestDisk:
         assert len(payloads(running.root)) == 152
         assert sum(event["messages"] for event in events(running.root, "dropped")) == dropped
 
-    def test_a_full_disk_loses_only_what_comes_meanwhile_and_the_count_is_written_down(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    @pytest.mark.parametrize("fault", ["write", "open"])
+    def test_a_fault_costs_only_what_comes_meanwhile_and_the_count_is_written_down(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str
     ) -> None:
-        full, write = threading.Event(), RawFile.write
+        broken, write, create = threading.Event(), RawFile.write, Folder.create
 
         def raw_write(self: Any, data: memoryview) -> int | None:
-            if full.is_set():
+            if fault == "write" and broken.is_set():
                 if len(data) < 50:
                     raise OSError(errno.ENOSPC, "No space left on device")
                 return write(self, data[:40])  # a part of it still fits
             return write(self, data)
 
+        def created(self: Folder, lane: str, now_ns: int) -> Any:
+            if fault == "open" and broken.is_set():
+                raise OSError(errno.EIO, "Input/output error")
+            return create(self, lane, now_ns)
+
         monkeypatch.setattr(RawFile, "write", raw_write)
+        monkeypatch.setattr(Folder, "create", created)
         running = Running(tmp_path / "rec")
         running.send(100)
         assert running.written(100)
-        full.set()
+        broken.set()
         running.send(50)
+        running.send(topic=CAMERA, payload=PICTURE)
         assert until(lambda: bool(running.recorder.blocked), 10)
         running.send(70)
         running.recorder.note("lost", why="meanwhile")
         assert until(lambda: running.recorder.counters["dropped"] == 70, 10)
-        full.clear()
+        broken.clear()
         assert until(lambda: running.recorder.counters["event_recovered"] == 1, 10)
         running.send(10)
         running.stop()
-        expected = [b"%d" % number for number in (*range(150), *range(220, 230))]
+        expected = [b"%d" % number for number in (*range(150), *range(221, 231))]
         assert sorted(payloads(running.root), key=int) == expected
-        gap = events(running.root, "gap")
-        assert [event["messages"] for event in gap] == [70]
+        assert payloads(running.root, CAMERA) == [PICTURE]
+        assert [event["messages"] for event in events(running.root, "gap")] == [70]
         assert [len(events(running.root, name)) for name in ("recovered", "lost")] == [1, 1]
 
     def test_the_oldest_media_go_first_and_what_is_not_ours_stays(self, tmp_path: Path) -> None:
@@ -360,32 +368,6 @@ class TestDisk:
             disk.close()
         assert {*range(20), running.sent - 1} <= found
 
-    def test_a_file_that_cannot_be_opened_costs_what_comes_meanwhile_and_no_more(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        create, refused = Folder.create, threading.Event()
-
-        def fails(self: Folder, lane: str, now_ns: int) -> Any:
-            if lane != "state" and not refused.is_set():
-                refused.set()
-                raise OSError(errno.EIO, "Input/output error")
-            return create(self, lane, now_ns)
-
-        monkeypatch.setattr(Folder, "create", fails)
-        running = Running(tmp_path / "rec")
-        running.send(50)
-        running.send(topic=CAMERA, payload=PICTURE)
-        assert until(lambda: bool(running.recorder.blocked), 10)
-        running.send(30)
-        assert until(lambda: not running.recorder.blocked, 10)
-        running.send(50)
-        running.stop()
-        dropped = running.recorder.counters["dropped"]
-        assert len(payloads(running.root)) + len(payloads(running.root, CAMERA)) + dropped == 131
-        assert dropped <= 30
-        assert payloads(running.root, CAMERA) == [PICTURE]
-        assert [event["messages"] for event in events(running.root, "gap")] == [dropped]
-
     def test_what_a_full_disk_never_took_is_counted_at_the_end(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -399,6 +381,11 @@ class TestDisk:
         running.stop()
         assert running.recorder.counters["dropped"] == 70
         assert len(payloads(running.root)) == 20
+
+    def test_no_room_from_the_start(self, tmp_path: Path) -> None:
+        running = Running(tmp_path / "rec", Options(free_bytes=1 << 60))
+        assert until(lambda: "the disk is full" in running.recorder.blocked, 10)
+        running.stop()
 
 
 def _slowly(write: Any, seconds: float) -> Any:
