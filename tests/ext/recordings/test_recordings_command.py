@@ -50,20 +50,6 @@ def test_list_and_info(folder: Path, run: Run) -> None:
     assert "gap: why no connection, lasted 60.0 s" in run.out
 
 
-def test_info_counts_what_is_in_the_period(folder: Path, run: Run) -> None:
-    assert run("recordings", "info", folder, "--since", "2000-01-01", "--until", "2000-01-02") == 0
-    assert "goob" not in run.out
-    topics = "a/b/c/outgoing/", "/b/c/outgoing/online", "a/b/c/outgoing/online"
-    with (folder / "other.mcap").open("wb", buffering=0) as file:
-        writer = RecordingWriter(file, library="other")
-        for topic in topics:
-            writer.add(writer.channel(topic, "json", {}), START_NS, b"{}")
-        writer.channel("a/b/unused/outgoing/online", "json", {})
-        writer.finish()
-    assert run("recordings", "info", folder / "other.mcap") == 0
-    assert re.findall(r"^(\S+): 1 messages", run.out, re.M) == ["a/b/c"]
-
-
 def test_search(folder: Path, run: Run) -> None:
     run("recordings", "search", folder, "--robot", "goob", "--topic", "outgoing/logs", "--text", "battery")
     (line,) = run.out.splitlines()

@@ -168,11 +168,6 @@ def test_a_device_that_is_not_there_is_tried_again_ever_more_slowly(streams: Str
     assert until(lambda: report(stream).running)
     assert device.openings == 4
     assert report(stream).restarts == 3
-    absent = Device(refuses=1000)
-    stream = streams(writer, absent)
-    assert until(lambda: absent.openings >= 2)
-    writer.wanted = False
-    assert rests(stream), "it delays nothing"
 
 
 @pytest.mark.parametrize("error", [DeviceError("unplugged"), ValueError("of a library")])

@@ -103,9 +103,7 @@ class Writer:
         writer = self._writer
         return writer.counters.snapshot() | {
             "wanted": writer.wanted,
-            "readers": writer.readers,
             "sharing": writer.shared,
-            "problem": writer.problem,
         }
 
     def stop(self) -> None:
