@@ -7,7 +7,7 @@ import time
 from abc import ABC, abstractmethod
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Generic, Protocol, Self, TypeVar
+from typing import Any, Self
 
 import msgspec
 
@@ -97,26 +97,18 @@ class Device(ABC):
                 self.write(number)
 
 
-class Encoded(Protocol):
-    @property
-    def encoding(self) -> str: ...
-
-
-T = TypeVar("T", bound=Encoded)
-
-
-class Operator(ABC, Generic[T]):
+class Operator(ABC):
     """Decodes every packet of one topic of the robot."""
 
     def __init__(self, port: int, metric: str) -> None:
         self.transport = client(f"operator-{metric}", port)
-        self.received: list[T] = []
+        self.received: list[Any] = []
         self.transport.subscribe(f"{BASE}/outgoing/{metric}", self.receive, qos=QoS.LATEST)
 
     @abstractmethod
     def receive(self, message: Message) -> None: ...
 
-    def wait(self, count: int, timeout: float = 20.0) -> list[T]:
+    def wait(self, count: int, timeout: float = 20.0) -> list[Any]:
         """Until so many packets more have come; returns these."""
         before = len(self.received)
         came = until(lambda: len(self.received) >= before + count, timeout)

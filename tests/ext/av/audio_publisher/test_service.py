@@ -36,7 +36,7 @@ class Mouth(Device):
         self.writer.write(samples.tobytes(), FrameInfo(**now, **self._form))
 
 
-class Ear(Operator[ReceivedSound]):
+class Ear(Operator):
     """Decodes every packet of the robot's sound."""
 
     def __init__(self, port: int) -> None:

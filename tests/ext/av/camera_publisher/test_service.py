@@ -47,7 +47,7 @@ class Seen:
     shape: tuple[int, ...]
 
 
-class Viewer(Operator[Seen]):
+class Viewer(Operator):
     """Decodes every picture, and reads its number."""
 
     def __init__(self, port: int) -> None:
