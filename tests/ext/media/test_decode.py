@@ -192,19 +192,15 @@ def test_every_jpeg_a_camera_may_send(options: list[int]) -> None:
 
 
 def hostile(chance: random.Random, packet: bytes) -> bytes:
-    """Cut off, with other bits behind its header, garbage, or with another byte in its header."""
-    made, first = bytearray(packet), 19 if packet.startswith(b"PBVD") else 0
-    match chance.randrange(4):
-        case 0:
-            return packet[: chance.choice([chance.randrange(len(packet)), len(packet) - 1])]
-        case 1:
-            for _ in range(chance.randint(1, 8)):
-                made[chance.randrange(first, len(made))] ^= 1 << chance.randrange(8)
-        case 2:
-            begin = chance.choice([b"", b"{", b'{"id":', b"PBVD\x01\x01\x00", b"PBVD\x01\x05\x01", b"\xff\xd8\xff"])
-            return begin + chance.randbytes(chance.randint(0, 300))
-        case 3:
-            made[chance.randrange(19)] = chance.randrange(256)
+    """Cut off, garbage, or with other bits behind its header."""
+    kind, made = chance.randrange(3), bytearray(packet)
+    if kind == 0:
+        return packet[: chance.choice([chance.randrange(len(packet)), len(packet) - 1])]
+    if kind == 1:
+        begin = chance.choice([b"", b"{", b'{"id":', b"PBVD\x01\x01\x00", b"PBVD\x01\x05\x01", b"\xff\xd8\xff"])
+        return begin + chance.randbytes(chance.randint(0, 300))
+    for _ in range(chance.randint(1, 8)):
+        made[chance.randrange(19, len(made))] ^= 1 << chance.randrange(8)
     return bytes(made)
 
 
