@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import random
 import struct
 import zlib
@@ -19,8 +18,6 @@ from pebble.extensions.media.jpeg import decode_jpeg, jpeg_size
 from pebble.extensions.media.json_video import inflate
 from pebble.extensions.media.packets import Picture, PictureKind
 from pebble.extensions.media.video import make_encoder
-from tests.ext.recordings.demo_robots import FRED, MEDIA, recorded
-from tests.kit.scene import read_counter
 from tests.support import cases
 
 T0 = 1_710_969_600_000
@@ -69,20 +66,6 @@ def test_anything_refused_breaks_the_chain(bad: bytes) -> None:
     packets, decoder = stream("h264"), VideoDecoder()
     assert frames(decoder, [*packets[:2], bad, *packets[2:7]]) == [0, 1, None, None, None, None, None, 6]
     assert decoder.problem
-
-
-def test_a_recorded_camera_counts_its_pictures_in_every_form() -> None:
-    """The number that the simulated camera draws into its pictures grows by one with each, whatever the form."""
-    packets, decoder = recorded(MEDIA, f"{FRED}/outgoing/front-camera"), VideoDecoder()
-    shown = [decoder.feed(packet) for packet in packets]
-    seen = [one for one in shown if one is not None]
-    assert len(seen) == len(packets) > 80
-    forms = ["json", "pbvd", "pbvz", "h264"]
-    assert list(dict.fromkeys(one.encoding for one in seen)) == forms
-    for name in forms:
-        counts = [read_counter(one.picture) for one in seen if one.encoding == name]
-        assert None not in counts
-        assert all(0 < after - before <= 2 for before, after in itertools.pairwise(counts)), name
 
 
 def test_raw_jpeg_is_a_key_frame_without_number_and_time() -> None:

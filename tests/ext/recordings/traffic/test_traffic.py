@@ -35,7 +35,7 @@ from pebble.extensions.recordings.traffic.results import (
 from pebble.extensions.recordings.traffic.sources import sources
 from pebble.extensions.recordings.traffic.tables import tables, write_csv
 from tests.ext.recordings.demo_robots import BENJR, DRIVE, FRED, GOOB, MEDIA
-from tests.ext.recordings.synthetic import START_NS, Sent, demo_folder, event, write_recording
+from tests.ext.recordings.traffic.test_index import START_NS, Sent, demo_folder, event, write_recording
 
 pytest.importorskip("duckdb")
 pytest.importorskip("matplotlib")
