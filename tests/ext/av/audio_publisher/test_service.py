@@ -105,7 +105,9 @@ def test_every_encoding_in_turn_carries_the_recorded_speech(local: Broker, remot
         assert until(lambda: (robot.newest.doing or "").startswith("pcm 16 kHz mono, "))
 
 
-def test_the_microphone_comes_later_and_comes_back(local: Broker, remote: Broker, ear: Ear) -> None:
+def test_the_microphone_comes_later_and_comes_back_and_so_does_the_remote_broker(
+    local: Broker, remote: Broker, ear: Ear
+) -> None:
     with publisher(local, remote) as robot:
         assert robot.reported(doing="waits for the microphone")
         with Mouth(robot.run_dir):
@@ -114,18 +116,13 @@ def test_the_microphone_comes_later_and_comes_back(local: Broker, remote: Broker
         assert until(lambda: "no sound" in (robot.newest.last_error or ""))
         with Mouth(robot.run_dir, 48000, 2):
             assert until(lambda: ear.received[-1].rate == 48000)
-        assert is_whole(ear.received)
-
-
-def test_the_remote_broker_goes_and_comes_back(local: Broker, remote: Broker, ear: Ear) -> None:
-    with publisher(local, remote) as robot, Mouth(robot.run_dir):
-        ear.wait(20)
-        remote.kill()
-        assert robot.reported(doing="rests: the remote side is away")
-        assert until(lambda: (robot.newest.dropped or 0) > 20)
-        assert robot.newest.last_error
-        remote.start()
-        ear.wait(20)
-        young = [at - one.captured_ms / 1000 for at, one in zip(ear.arrived, ear.received, strict=True)][-10:]
-        assert median(young) < 0.5  # nothing from before
-        assert robot.reported(last_error=None)
+            assert is_whole(ear.received)
+            remote.kill()
+            assert robot.reported(doing="rests: the remote side is away")
+            assert until(lambda: (robot.newest.dropped or 0) > 20)
+            assert robot.newest.last_error
+            remote.start()
+            ear.wait(20)
+            ages = [at - one.captured_ms / 1000 for at, one in zip(ear.arrived, ear.received, strict=False)]
+            assert median(ages[-10:]) < 0.5, "nothing from before"
+            assert robot.reported(last_error=None)

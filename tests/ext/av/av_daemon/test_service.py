@@ -51,13 +51,6 @@ class Robot(ProgramRobot):
         self.world.transport.publish(topic, raw, qos=QoS.DELIVERED, retain=retain)
 
 
-@pytest.fixture
-def robot(local: Broker) -> Iterator[Robot]:
-    """A robot for this test alone."""
-    with Robot("mqtt", local.port, SYNTHETIC) as robot:
-        yield robot
-
-
 @pytest.fixture(scope="module")
 def running(local: Broker) -> Iterator[Robot]:
     """One robot for tests that leave it as it was."""
@@ -104,30 +97,28 @@ def test_it_publishes_the_status_of_other_programs(running: Robot) -> None:
     assert "x" not in running.status
 
 
-def test_numbers_alone_are_published_rarely_and_everything_else_soon(robot: Robot) -> None:
+def test_numbers_alone_are_published_rarely_and_everything_else_soon_also_its_end(local: Broker) -> None:
     def sent(kbits: int, **more: Any) -> None:
         doing = f"h264 640x480, {kbits} kbit/s"
         trouble = f"no picture for {kbits} s"
         robot.report("other", MediaReport(running=True, doing=doing, bitrate=1000 * kbits, last_error=trouble, **more))
 
-    assert until(lambda: robot.status)
-    sent(200)
-    assert until(lambda: "other" in robot.status)
-    before = len(robot.world.on("media-status"))
-    for kbits in range(201, 206):
-        sent(kbits)
-        time.sleep(0.3)
-    assert len(robot.world.on("media-status")) - before <= 1
-    sent(100, reduced="size 1/2")
-    assert robot.reported("other", 3, reduced="size 1/2")
-
-
-def test_it_ends_at_once_and_publishes_it(robot: Robot) -> None:
-    with FrameReader(robot.run_dir, "camera") as reader:
-        assert reader.read(10) is not None
-        assert robot.reported("camera", running=True)
-        assert robot.daemon.end(signal.SIGTERM) == 0
-    assert until(lambda: robot.status["camera"] == {"running": False, "doing": "ended"})
+    with Robot("mqtt", local.port, SYNTHETIC) as robot:
+        assert until(lambda: robot.status)
+        sent(200)
+        assert until(lambda: "other" in robot.status)
+        before = len(robot.world.on("media-status"))
+        for kbits in range(201, 206):
+            sent(kbits)
+            time.sleep(0.3)
+        assert len(robot.world.on("media-status")) - before <= 1
+        sent(100, reduced="size 1/2")
+        assert robot.reported("other", 3, reduced="size 1/2")
+        with FrameReader(robot.run_dir, "camera") as reader:
+            assert reader.read(10) is not None
+            assert robot.reported("camera", running=True)
+            assert robot.daemon.end(signal.SIGTERM) == 0
+        assert until(lambda: robot.status["camera"] == {"running": False, "doing": "ended"})
 
 
 def test_a_killed_capture_program_is_back_and_the_reader_never_noticed(

@@ -102,28 +102,25 @@ def test_every_form_in_turn_at_the_wanted_rate(local: Broker, remote: Broker, vi
         assert viewer.decoder.problem == ""
 
 
-def test_nothing_is_encoded_while_the_remote_side_is_away(local: Broker, remote: Broker, viewer: Viewer) -> None:
-    with publisher(local, remote) as robot, Camera(robot.run_dir) as camera:
-        viewer.wait(10)
-        assert camera.writer.wanted
-        remote.kill()
-        assert robot.reported(running=False, doing="rests: the remote side is away")
-        assert until(lambda: robot.reports[-1].last_error)
-        assert until(lambda: not camera.writer.wanted)
-        before = len(viewer.received)
-        remote.start()
-        assert until(lambda: len(viewer.received) > before + 5, 20)
-        assert viewer.received[before].keyframe
-        assert robot.reported(running=True, last_error=None)
-
-
-def test_a_camera_that_gives_nothing_is_reported(local: Broker, remote: Broker, viewer: Viewer) -> None:
+def test_it_rests_while_the_remote_side_is_away_and_reports_a_camera_that_gives_nothing(
+    local: Broker, remote: Broker, viewer: Viewer
+) -> None:
     def complains() -> bool:
         return bool(robot.reports) and "no frame from the camera" in (robot.reports[-1].last_error or "")
 
     with publisher(local, remote) as robot:
         assert until(complains, 15)
         assert robot.reports[-1].doing == "waits for the camera"
-        with Camera(robot.run_dir):
-            viewer.wait(5)
+        with Camera(robot.run_dir) as camera:
+            viewer.wait(10)
+            assert camera.writer.wanted
+            remote.kill()
+            assert robot.reported(running=False, doing="rests: the remote side is away")
+            assert until(lambda: robot.reports[-1].last_error)
+            assert until(lambda: not camera.writer.wanted)
+            before = len(viewer.received)
+            remote.start()
+            assert until(lambda: len(viewer.received) > before + 5, 20)
+            assert viewer.received[before].keyframe
+            assert robot.reported(running=True, last_error=None)
         assert until(complains, 15)
