@@ -97,7 +97,7 @@ def test_h264_is_requested_while_a_client_subscribes_and_passed_on_as_foxglove_e
     )
 
 
-def test_a_client_that_comes_later_begins_with_a_key_frame(broker: Broker) -> None:
+def test_a_client_that_comes_later_begins_with_a_key_frame_and_sees_why_there_are_no_pictures(broker: Broker) -> None:
     with filming(broker) as robot, live(broker) as server:
         first, second = Watcher(server.address), Watcher(server.address)
         first.subscribe(H264)
@@ -105,8 +105,9 @@ def test_a_client_that_comes_later_begins_with_a_key_frame(broker: Broker) -> No
         second.subscribe(H264)
         assert until(lambda: any(5 in nal_types(video.data) for video in second.of(H264)), 20)
         assert {**REQUESTED, "keyframe": True} in robot.requests
-        second.close()
-        first.close()
+        robot.transport.publish(CAPABILITIES, capabilities({**VIDEO, "available": False}), retain=True)
+        assert until(lambda: second.statuses, 20)
+        assert second.statuses[0]["message"] == f"{CAMERA}: it has no camera"
         assert until(lambda: robot.requests[-1] == WITHDRAWN, 20)
 
 
@@ -133,17 +134,6 @@ def test_a_signal_withdraws_the_requests(broker: Broker) -> None:
         assert errors.startswith("Showed 1 robots in ")
         assert until(lambda: robot.requests[-1] == WITHDRAWN and robot.flags == [True, False])
         assert until(lambda: watcher.closed)
-
-
-def test_why_there_are_no_pictures_is_shown_in_foxglove(broker: Broker) -> None:
-    with filming(broker) as robot, live(broker) as server:
-        watcher = Watcher(server.address)
-        watcher.subscribe(H264)
-        assert until(lambda: watcher.count(H264), 30)
-        robot.transport.publish(CAPABILITIES, capabilities({**VIDEO, "available": False}), retain=True)
-        assert until(lambda: watcher.statuses, 20)
-        assert watcher.statuses[0]["message"] == f"{CAMERA}: it has no camera"
-        assert until(lambda: robot.requests[-1] == WITHDRAWN, 20)
 
 
 def test_sound_becomes_samples(broker: Broker) -> None:

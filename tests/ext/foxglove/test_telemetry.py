@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -38,29 +37,13 @@ def robot(broker: Broker) -> Iterator[Transport]:
     robot.close()
 
 
-def test_a_log_record_gets_the_schema_that_foxglove_has_for_it(broker: Broker, robot: Transport) -> None:
-    """The messages themselves are tested where a recording is exported: they are the same."""
-    t, topic = int(time.time() * 1000), f"{GOOB}/outgoing/logs/log"
-    record = LogRecord(t=t, level="WARNING", service="bridge", message="careful")
-    with live(broker) as server:
-        watcher = Watcher(server.address)
-        publish(robot, GOOB, LOGS, record)
-        watcher.subscribe(topic)
-
-        def received() -> bool:
-            publish(robot, GOOB, LOGS, record)
-            return bool(watcher.of(topic))
-
-        assert until(received, 20, step=0.05)
-    (log, *_) = watcher.of(topic)
-    assert (log.level, log.name, log.message, log.timestamp.ToMilliseconds()) == (3, "bridge", "careful", t)
-
-
-def test_json_has_the_schema_of_the_contract_and_its_last_value_for_who_subscribes_later(
+def test_each_value_has_its_schema_and_the_last_one_is_there_for_who_subscribes_later(
     broker: Broker, robot: Transport
 ) -> None:
+    """The messages of Foxglove's schemas are tested where a recording is exported: they are the same."""
     publish(robot, GOOB, CHARGING_LEVEL, ChargingLevel(value=7.4))
     robot.publish(f"{GOOB}/outgoing/diagnostics", b"[1, 2]", retain=True)
+    record = LogRecord(t=1_790_000_000_123, level="WARNING", service="bridge", message="careful")
     with live(broker) as server:
         first, second = Watcher(server.address), Watcher(server.address)
         first.subscribe(LEVEL)
@@ -69,10 +52,20 @@ def test_json_has_the_schema_of_the_contract_and_its_last_value_for_who_subscrib
         assert until(lambda: second.of(LEVEL))
         first.subscribe(f"{GOOB}/outgoing/diagnostics")
         assert until(lambda: first.of(f"{GOOB}/outgoing/diagnostics") == [{"value": [1, 2]}])
+        publish(robot, GOOB, LOGS, record)
+        first.subscribe(f"{GOOB}/outgoing/logs/log")
+
+        def logged() -> list[Any]:
+            publish(robot, GOOB, LOGS, record)
+            return first.of(f"{GOOB}/outgoing/logs/log")
+
+        assert until(logged, 20, step=0.05)
+        log = logged()[0]
     channel = first.channels[LEVEL]
     assert (channel["encoding"], channel["schemaName"]) == ("json", "pebble.ChargingLevel")
     assert json.loads(channel["schema"])["properties"]["value"] == {"type": "number"}
     assert second.of(LEVEL)[0]["value"] == 7.4
+    assert (log.level, log.name, log.message, log.timestamp.ToMilliseconds()) == (3, "bridge", "careful", record.t)
 
 
 def test_a_robot_that_comes_later_gets_its_channels_then_and_one_that_goes_keeps_them(

@@ -45,10 +45,10 @@ class Robot(ProgramRobot):
         """Wait until the status of a device has these fields."""
         return until(lambda: fields.items() <= self.status.get(device, {}).items(), timeout)
 
-    def report(self, program: str, report: MediaReport | bytes, *, retain: bool = False) -> None:
+    def report(self, program: str, report: MediaReport | bytes) -> None:
         raw = report if isinstance(report, bytes) else msgspec.json.encode(report)
         topic = MEDIA_REPORT.topic(self.config.base, program=program)
-        self.world.transport.publish(topic, raw, qos=QoS.DELIVERED, retain=retain)
+        self.world.transport.publish(topic, raw, qos=QoS.DELIVERED)
 
 
 @pytest.fixture(scope="module")
