@@ -13,7 +13,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import av
 import cv2
 import numpy as np
 import pytest
@@ -40,10 +39,8 @@ _nal_types = re.compile(rb"\x00\x00\x01(.)", re.DOTALL).findall
 
 
 @contextmanager
-def filming(
-    broker: Broker, *, fps: float = 15, size: tuple[int, int] = (160, 120), **video: Any
-) -> Iterator[PictureRobot]:
-    robot = PictureRobot({**VIDEO, **video}, fps=fps, size=size, transport=client(broker))
+def filming(broker: Broker, *, fps: float = 15, **video: Any) -> Iterator[PictureRobot]:
+    robot = PictureRobot({**VIDEO, **video}, fps=fps, size=(160, 120), transport=client(broker))
     try:
         yield robot
     finally:
@@ -52,19 +49,6 @@ def filming(
 
 def nal_types(unit: bytes) -> list[int]:
     return [byte[0] & 31 for byte in _nal_types(unit)]
-
-
-def decoded(image: Any) -> Any:
-    return cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_COLOR)
-
-
-def counters(pictures: list[Any]) -> list[int | None]:
-    return [read_counter(np.asarray(picture, np.uint8)) for picture in pictures]
-
-
-def follow_each_other(numbers: list[int | None]) -> bool:
-    known = [number for number in numbers if number is not None]
-    return len(known) == len(numbers) and known == list(range(known[0], known[0] + len(known)))
 
 
 def test_h264_is_requested_while_a_client_subscribes_and_passed_on_as_foxglove_expects_it(broker: Broker) -> None:
@@ -84,12 +68,6 @@ def test_h264_is_requested_while_a_client_subscribes_and_passed_on_as_foxglove_e
     assert all(unit.startswith(b"\x00\x00\x00\x01") for unit in units)
     assert [5 in nal_types(unit) for unit in units] == [{5, 7, 8} <= set(nal_types(unit)) for unit in units]
     assert 31 not in {kind for unit in units for kind in nal_types(unit)}  # the seal is ours
-    decoder = av.CodecContext.create("h264", "r")
-    decoder.options = {"flags": "+low_delay"}
-    shown = [decoder.decode(av.Packet(unit)) for unit in units]
-    assert {len(frames) for frames in shown} == {1}  # a picture in each message, which waits for no later one
-    assert {int(frame.pict_type) for (frame,) in shown} <= {1, 2}  # I and P: 3 is B
-    assert follow_each_other(counters([frame.to_ndarray(format="bgr24") for (frame,) in shown]))
     stamps = [video.timestamp.ToMilliseconds() for video in videos]
     assert stamps == sorted(stamps)
     assert all(
@@ -111,16 +89,17 @@ def test_a_client_that_comes_later_begins_with_a_key_frame_and_sees_why_there_ar
         assert until(lambda: robot.requests[-1] == WITHDRAWN, 20)
 
 
-@pytest.mark.parametrize("encoding", ["json", "h264"])
-def test_pictures_of_every_encoding_become_jpegs(broker: Broker, encoding: str) -> None:
-    with filming(broker, encoding=encoding) as robot, live(broker) as server:
+def test_pictures_become_jpegs(broker: Broker) -> None:
+    with filming(broker, encoding="json") as robot, live(broker) as server:
         watcher = Watcher(server.address)
         watcher.subscribe(JPEG)
         assert until(lambda: watcher.count(JPEG) >= 12, 30)
         assert robot.requests[0] == {"enabled": True}  # as configured: what others see of it does not change
     images = watcher.of(JPEG)
     assert {(image.format, image.frame_id) for image in images} == {("jpeg", "goob")}
-    assert follow_each_other(counters(list(map(decoded, images))))
+    pictures = [cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_COLOR) for image in images]
+    numbers = [read_counter(np.asarray(picture, np.uint8)) for picture in pictures]
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
 
 
 def test_a_signal_withdraws_the_requests(broker: Broker) -> None:

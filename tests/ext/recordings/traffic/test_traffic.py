@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import re
 import statistics
 from collections import defaultdict
@@ -262,17 +261,8 @@ def test_a_damaged_index_is_named(tmp_path):
 EVIL = "<img src=x onerror=alert(1)>"
 
 
-@pytest.fixture(scope="module")
-def written(recorded, tmp_path_factory) -> list[Path]:
-    return write_report(recorded, tmp_path_factory.mktemp("report"), csv=True)
-
-
-@pytest.fixture(scope="module")
-def page(written) -> str:
-    return written[0].read_text()
-
-
-def test_nothing_is_loaded_or_run_and_every_drawing_has_a_name(page, recorded):
+def test_nothing_is_loaded_or_run_and_every_drawing_has_a_name(recorded, tmp_path):
+    page = write_report(recorded, tmp_path)[0].read_text()
     assert re.findall(r"<(?:script|img|link|iframe|object|image)\b", page) == []
     links = re.findall(r'(?:href|src)="([^"]*)"', page)
     assert links
@@ -299,16 +289,6 @@ def test_names_of_robots_do_nothing(tmp_path):
     page = write_report(found, tmp_path)[0].read_text()
     assert EVIL not in page
     assert "&lt;img" in page
-
-
-def test_csv_has_a_file_for_each_table(recorded, written):
-    assert [path.suffix for path in written] == [".html", *[".csv"] * len(tables(recorded))]
-    folder = written[0].parent
-    (row,) = csv.DictReader((folder / "table-4-1-media-bandwidth.csv").open())
-    (fred,) = (robot for robot in recorded.robots if robot.robot == row["robot"] == FRED)
-    assert float(row["audio_median_kbps"]) == pytest.approx(fred.of(AUDIO).median_kbps, abs=0.05)
-    outages = list(csv.DictReader((folder / "outages.csv").open()))
-    assert len(outages) == sum(len(robot.outages) for robot in recorded.robots)
 
 
 @pytest.mark.parametrize("name", ["=1+1", "\tx"])
