@@ -140,25 +140,30 @@ def test_a_deep_reader_gets_them_all_in_order_and_small_frames_travel_as_bytes(t
         assert (reader.problem, writer.shared, writer.problem, writer.counters["fallbacks"]) == ("", False, "", 0)
 
 
-def test_a_writer_sends_nothing_without_readers(net: FramesNet) -> None:
-    writer = net.writer()
+def test_readers_and_writers_that_are_killed_are_noticed_and_their_segments_swept(net: FramesNet) -> None:
+    writer = net.writer(size=SMALL)
     resting = writer.has(unwanted=10)
     assert (resting["wanted"], resting.get("written", 0)) == (False, 0)
-    reader = net.reader()
-    assert reader.has(frames=10)["wrong"] == 0
-    reader.kill()
-    writer.reaches(lambda printed: not printed["wanted"])
-
-
-def test_living_readers_find_a_restarted_writer_within_a_second(net: FramesNet) -> None:
     readers = [net.reader(), net.reader(views=True)]
-    for life in (1, 2):
-        writer = net.writer(size=SMALL)
+
+    def all_receive(life: int) -> None:
         for reader in readers:
             before = reader.ask().get("frames", 0)
-            reader.reaches(lambda seen, before=before: seen["frames"] > before, 3)
-            assert reader.ask()["writers"] == life
-        writer.kill()
+            reader.reaches(lambda seen: seen["frames"] > before, 3)
+            assert (reader.ask()["writers"], reader.ask()["wrong"]) == (life, 0)
+
+    all_receive(1)
+    writer.kill()
+    writer = net.writer(size=SMALL)
+    all_receive(2)
+    maps = [line for peer in (writer, *readers) for line in Path(f"/proc/{peer.pid}/maps").read_text().splitlines()]
+    used = {SHM / Path(line.split()[5]).name for line in maps if ".zenoh" in line}
+    assert len(used) >= 2
+    for reader in readers:
+        reader.kill()
+    writer.reaches(lambda printed: not printed["wanted"])
+    writer.kill()
+    assert until(lambda: segments.sweep() >= 0 and not any(path.exists() for path in used), 5)
 
 
 def test_there_is_one_writer_at_a_time(tmp_path: Path) -> None:
@@ -348,17 +353,6 @@ def test_anything_with_bytes_can_be_written(tmp_path: Path) -> None:
         assert big is not None
         assert (big.data.size, big.shared) == (1_000_000, False)
         assert writer.counters["fallbacks"] == 1
-
-
-def test_segments_of_killed_processes_are_swept(net: FramesNet) -> None:
-    reader, writer = net.reader(views=True), net.writer(size=SMALL)
-    reader.has(frames=5)
-    maps = [line for peer in (reader, writer) for line in Path(f"/proc/{peer.pid}/maps").read_text().splitlines()]
-    used = {SHM / Path(line.split()[5]).name for line in maps if ".zenoh" in line}
-    assert len(used) >= 2
-    writer.kill()
-    reader.kill()
-    assert until(lambda: segments.sweep() >= 0 and not any(path.exists() for path in used), 5)
 
 
 def test_the_name_of_a_stream_is_part_of_a_path(tmp_path: Path) -> None:
