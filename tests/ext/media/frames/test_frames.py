@@ -149,7 +149,7 @@ def test_readers_and_writers_that_are_killed_are_noticed_and_their_segments_swep
     def all_receive(life: int) -> None:
         for reader in readers:
             before = reader.ask().get("frames", 0)
-            reader.reaches(lambda seen: seen["frames"] > before, 3)
+            reader.reaches(lambda seen, before=before: seen["frames"] > before, 3)
             assert (reader.ask()["writers"], reader.ask()["wrong"]) == (life, 0)
 
     all_receive(1)
