@@ -16,8 +16,6 @@ from tests.support import Broker, until
 def test_which_robots_are_shown_has_to_be_named(run: Run, tmp_path: Path) -> None:
     assert run("foxglove") == 1
     assert run.err == ("pebble: which robots is missing: name either a robot's config file or --url mqtt://BROKER\n")
-    assert run("foxglove", config_file(tmp_path), "--url", "mqtt://127.0.0.1") == 1
-    assert "either" in run.err
     assert run("foxglove", config_file(tmp_path)) == 1
     assert run.err.startswith("pebble: services.mqtt_bridge.remote_mqtt.host: is not set")
     assert run("foxglove", "--url", f"zenoh:{tmp_path}") == 1
