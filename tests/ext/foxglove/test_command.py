@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.commands.command_line import Run, config_file
-from tests.ext.foxglove.live import FRED, GOOB, Live, client, online
-from tests.ext.foxglove.watcher import Watcher
+from tests.ext.foxglove.live import FRED, GOOB, Live, Watcher, client, online
 from tests.support import Broker, until
 
 

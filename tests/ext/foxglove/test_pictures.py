@@ -17,8 +17,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.ext.foxglove.live import Live, client, live
-from tests.ext.foxglove.watcher import Watcher, parser
+from tests.ext.foxglove.live import Live, Watcher, client, live, parser
 from tests.ext.page.media.robots import (
     AUDIO,
     CAMERA,

@@ -23,8 +23,7 @@ from pebble.contract.payloads import (
 )
 from pebble.extensions.foxglove.json_channels import json_spec
 from pebble.transports import Message, QoS, Transport
-from tests.ext.foxglove.live import FRED, GOOB, client, live, online, publish
-from tests.ext.foxglove.watcher import Watcher
+from tests.ext.foxglove.live import FRED, GOOB, Watcher, client, live, online, publish
 from tests.support import Broker, until
 
 ONLINE, LEVEL = f"{GOOB}/outgoing/online", f"{GOOB}/outgoing/charging-level"

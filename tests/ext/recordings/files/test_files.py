@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import os
 import random
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
+from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
 from pebble.extensions.recordings.catalogue import look_at
@@ -15,9 +18,40 @@ from pebble.extensions.recordings.files.reader import RecordingFile
 from pebble.extensions.recordings.files.recorded import UNNAMED, RecordingError
 from pebble.extensions.recordings.files.rewrite import rewrite
 from tests.ext.recordings.demo_robots import DRIVE, MEDIA
-from tests.ext.recordings.files.other_readers import Counted, by_mcap, by_mcap_core
 from tests.ext.recordings.messages import START_NS, STEP_NS, contents, is_part_of, read, write
+from tests.kit.npm import package
 from tests.support import cases
+
+
+class Counted(NamedTuple):
+    """Messages of a file."""
+
+    statistics: int
+    indexed: int
+    streamed: int
+
+
+def by_mcap(path: Path) -> Counted:
+    """The messages as the package ``mcap`` reads them."""
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        indexed = sum(1 for _ in reader.iter_messages())
+        file.seek(0)
+        names = [type(record).__name__ for record in StreamReader(file, validate_crcs=True).records]
+        return Counted(summary.statistics.message_count, indexed, names.count("Message"))
+
+
+def by_mcap_core(paths: list[Path]) -> list[Counted]:
+    """The messages of each file as npm's ``@mcap/core`` reads them."""
+    package("@mcap/core")
+    command = ["node", Path(__file__).with_name("mcap_core.cjs"), *paths]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    assert (done.returncode, done.stderr) == (0, "")
+    return [Counted(*map(int, line.split())) for line in done.stdout.splitlines()]
+
 
 MESSAGES = 2000
 TIMES = cases(1, 6)
