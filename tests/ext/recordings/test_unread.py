@@ -7,10 +7,8 @@ import io
 import os
 import random
 import signal
-import struct
 import subprocess
 import sys
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -50,8 +48,8 @@ def payload(number: int) -> bytes:
 
 
 def by_package(
-    *, order: str = "forward", schema: bool = True, beside: bool = False,
-    sequence: Callable[[int], int] = lambda number: number, library: str = "other", start_ns: int = START_NS,
+    *, order: str = "forward", beside: bool = False,
+    sequence: Callable[[int], int] = lambda number: number, library: str = "other",
     **options: Any,
 ) -> bytes:  # fmt: skip
     """The message ``number`` is of goob, or each fourth of fred; its time grows with its number."""
@@ -62,50 +60,13 @@ def by_package(
         writer.add_metadata("about", {"place": "hall"})
         writer.add_metadata("about", {"place": "yard"})
         writer.add_attachment(1, 2, "plan.txt", "text/plain", b"walls")
-    number = writer.register_schema(*SCHEMA) if schema else 0
+    number = writer.register_schema(*SCHEMA)
     goob, fred = (writer.register_channel(topic, "json", number) for topic in (GOOB, FRED))
     for one in ORDERS[order]:
-        writer.add_message(fred if one % 4 == 3 else goob, start_ns + one * STEP_NS, payload(one), 0, sequence(one))
+        writer.add_message(fred if one % 4 == 3 else goob, START_NS + one * STEP_NS, payload(one), 0, sequence(one))
     writer.finish()
     return out.getvalue()
 
-
-# -- record by record
-
-
-def record(op: int, body: bytes) -> bytes:
-    return struct.pack("<BQ", op, len(body)) + body
-
-
-def text(value: str | bytes) -> bytes:
-    raw = value.encode() if isinstance(value, str) else value
-    return struct.pack("<I", len(raw)) + raw
-
-
-def channel(number: int, topic: str, encoding: str = "json") -> bytes:
-    return record(4, struct.pack("<HH", number, 0) + text(topic) + text(encoding) + text(b""))
-
-
-def message(number: int) -> bytes:
-    of = 2 if number % 4 == 3 else 1
-    at = START_NS + number * STEP_NS
-    return record(5, struct.pack("<HIQQ", of, number, at, at) + payload(number))
-
-
-def chunk(*records: bytes) -> bytes:
-    raw = b"".join(records)
-    head = struct.pack("<QQQI", START_NS, START_NS + COUNT * STEP_NS, len(raw), zlib.crc32(raw))
-    return record(6, head + text("") + struct.pack("<Q", len(raw)) + raw)
-
-
-def whole(*data: bytes, library: str = "pebble 1.0") -> bytes:
-    """A file without a summary."""
-    return b"".join(
-        [MAGIC, record(1, text("") + text(library)), *data, record(15, bytes(4)), record(2, bytes(20)), MAGIC]
-    )
-
-
-MESSAGES = [message(number) for number in range(COUNT)]
 
 #: All hold the same messages.
 VALID: Final[dict[str, bytes]] = {
@@ -119,18 +80,9 @@ VALID: Final[dict[str, bytes]] = {
 #: Files that are not read at all: what another program wrote needs an index of all its messages.
 REFUSED: Final[dict[str, bytes]] = {
     "no chunks": by_package(use_chunking=False),
-    "no statistics": by_package(use_statistics=False),
-    "no index of chunks": by_package(index_types=IndexType.ALL & ~IndexType.CHUNK),
     "no index of messages": by_package(index_types=IndexType.ALL & ~IndexType.MESSAGE),
     "summary without channels": by_package(repeat_channels=False, repeat_schemas=False),
     "cut off": by_package()[:-30],
-}
-LATEST: Final = (1 << 64) - 1
-#: Messages that differ in their times or encodings.
-OTHERS: Final[dict[str, bytes]] = {
-    "no schema": by_package(schema=False),
-    "the latest time": by_package(start_ns=LATEST - COUNT * STEP_NS),
-    "two channels of one topic": whole(channel(1, GOOB), channel(2, GOOB), chunk(*MESSAGES)),
 }
 
 
@@ -156,7 +108,6 @@ DAMAGED: Final[dict[str, tuple[bytes, str]]] = {
     "the begin": (flipped(_FILE, 3), "does not begin as MCAP"),
     "the summary": (flipped(_FILE, _of(11, _FILE) + 20), "its end is missing or damaged"),
     "cut off in a chunk": (_FILE[: _of(6, _FILE) + 90], "at its end cannot be read"),
-    "a channel that is none": (whole(channel(1, GOOB), chunk(*MESSAGES)), "without a topic"),
     "empty": (b"", "is empty"),
 }  # fmt: skip
 
@@ -215,25 +166,9 @@ def exported(path: Path) -> list[tuple[Any, ...]]:
     with path.open("rb") as file:
         found = make_reader(file, validate_crcs=True).iter_messages()
         return [
-            (*((schema.name, schema.encoding, schema.data) if schema else ()), channel.topic, message.data)
+            (schema.name, schema.encoding, schema.data, channel.topic, message.data)
             for schema, channel, message in found
         ]
-
-
-@pytest.mark.parametrize("name", OTHERS)
-def test_other_topics_times_and_encodings(tmp_path: Path, run: Run, name: str) -> None:
-    path, copy = stored(tmp_path, OTHERS[name]), tmp_path / "copy.mcap"
-    for command in (["list"], ["info"], ["search"]):
-        assert run("recordings", *command, tmp_path / "rec", columns=200) == 0
-        assert f"{COUNT} messages" in run.out + run.err
-    assert run("recordings", "export", path, copy) == 0
-    assert (len(exported(copy)), len(contents(path))) == (COUNT, COUNT)
-
-
-def test_topics_of_no_robot_are_named(tmp_path: Path, run: Run) -> None:
-    path = stored(tmp_path, whole(channel(1, "/imu", encoding="cdr"), channel(2, FRED), chunk(*MESSAGES)))
-    assert run("recordings", "info", path) == 0
-    assert "Topics that are of no robot: 30 messages\n          30  /imu\n" in run.out
 
 
 READERS = [
@@ -241,7 +176,7 @@ READERS = [
     ["export", "{out}.wav", "-r", "goob"], ["analyse", "--output", "{out}"],
 ]  # fmt: skip
 #: What is found out by reading messages only: a summary says nothing of it.
-IN_CHUNKS = {"a chunk", "the kind of a chunk", "a channel that is none"}
+IN_CHUNKS = {"a chunk", "the kind of a chunk"}
 WRITERS = [["rm", "--robot", "fred", "--yes"], ["rm", "--since", "2000-01-01", "--yes"]]
 
 
@@ -412,7 +347,7 @@ class TestMending:
         assert run("recordings", "list", tmp_path / "rec", columns=200) == 0
         assert "20 missing" in run.out
 
-    @pytest.mark.parametrize("data", [b"", whole(library="pebble 1.0")[:-60]])
+    @pytest.mark.parametrize("data", [b"", _FILE[: _of(6, _FILE)]])
     def test_a_file_without_messages_goes(self, tmp_path: Path, run: Run, data: bytes) -> None:
         path = stored(tmp_path, data, f"{NAME}.active")
         assert run("recordings", "mend", tmp_path / "rec") == 0
