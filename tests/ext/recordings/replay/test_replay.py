@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -77,14 +76,6 @@ def meanwhile(job: Callable[[], object]) -> Iterator[None]:
     thread.join(20)
 
 
-def ends(process: subprocess.Popen[str], timeout: float = 20) -> tuple[int, str, str]:
-    try:
-        out, err = process.communicate(timeout=timeout)
-    finally:
-        process.kill()
-    return process.returncode, out, err
-
-
 def test_replayed_at_ten_times_its_speed_it_is_the_same(
     tmp_path: Path, operator: Reference, at: tuple[str, str], run: Run
 ) -> None:
@@ -130,8 +121,7 @@ def test_ctrl_c_leaves_nothing_that_moves(tmp_path: Path, operator: Reference, a
     process = program("replay", walk(tmp_path), *at, "--incoming")
     assert until(lambda: len(operator.of(LOGS)) > 2)
     process.send_signal(signal.SIGINT)
-    code, _, err = ends(process)
-    assert (code, err) == (0, "")
+    assert (process.communicate(timeout=20)[1], process.returncode) == ("", 0)
     assert until(lambda: states(operator)[-1] is False, 3)
     assert json.loads(operator.of(f"{REPLAYED}/incoming/drive-values")[-1])["valid_ms"] == 0
 
