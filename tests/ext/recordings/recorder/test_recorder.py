@@ -299,8 +299,8 @@ class TestDisk:
         foreign.write_bytes(bytes(100_000))
         options = Options(free_bytes=0, rotate_seconds=0.4, keep_bytes=60_000)
         running, rng = Running(root, options), random.Random(1)
-        for _ in range(45):
-            running.send(topic=CAMERA, payload=PICTURE + rng.randbytes(4000))
+        for _ in range(60):
+            running.send(topic=CAMERA, payload=PICTURE + rng.randbytes(3000))
             running.send()
             time.sleep(0.05)
         running.stop()
@@ -309,7 +309,7 @@ class TestDisk:
         assert sum(entry.size for entry in entries) < 60_000 + 60_000
         assert len(events(root, "pruned")) >= 2
         assert all("media" in event["file"] for event in events(root, "pruned")[:2])
-        assert len(payloads(root)) == 45
+        assert len(payloads(root)) == 60
 
     def test_files_that_are_too_old_go_one_in_a_minute(self, tmp_path: Path) -> None:
         """The clock may have been set wrong."""
