@@ -1,7 +1,6 @@
 """A fake rpicam-vid: the synthetic scene on stdout, as JPEG pictures or raw planes.
 
-``FAKE`` in the environment: ``quiet`` (sends nothing), ``hangs`` (stops after 5 pictures), ``refuses`` (ends at once,
-with a complaint).
+``FAKE`` in the environment: ``quiet`` (sends nothing), ``refuses`` (ends at once, with a complaint).
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ def main() -> None:
     scene, picture = Scene(width, height), np.empty((height, width, 3), np.uint8)
     begin = time.monotonic()
     for number in count():
-        if kind == "quiet" or (kind == "hangs" and number == 5):
+        if kind == "quiet":
             time.sleep(1000)
         scene.render(number, picture)
         sys.stdout.buffer.write(cv2.imencode(".jpg", picture)[1].tobytes())

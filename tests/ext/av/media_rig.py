@@ -7,7 +7,7 @@ import time
 from abc import ABC, abstractmethod
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Generic, Protocol, Self, TypeVar
+from typing import Any, Self
 
 import msgspec
 
@@ -20,7 +20,7 @@ from tests.support import until
 
 
 class MediaProgram(ProgramRobot):
-    """The service called ``name`` of a robot with ``kind`` inside, and what it reports there.
+    """The service called ``name`` of a robot, and what it reports inside.
 
     ``section`` of services.mqtt_bridge.media holds the ``options``; operators' requests come on ``request``.
     """
@@ -28,11 +28,11 @@ class MediaProgram(ProgramRobot):
     process: Program
 
     def __init__(
-        self, name: str, section: str, request: str, kind: str, local_port: int, remote_port: int, **options: Any
+        self, name: str, section: str, request: str, local_port: int, remote_port: int, **options: Any
     ) -> None:
         remote = {"host": "127.0.0.1", "port": remote_port, "silence_seconds": SILENCE_S}
         bridge = {"enabled": True, "remote_mqtt": remote, "media": {section: options}}
-        super().__init__(kind, local_port, {"mqtt_bridge": bridge}, robot=ROBOT)
+        super().__init__("mqtt", local_port, {"mqtt_bridge": bridge}, robot=ROBOT)
         self.name, self._request, self.run_dir = name, request, self.config.run_dir()
 
     def __enter__(self) -> Self:
@@ -97,26 +97,18 @@ class Device(ABC):
                 self.write(number)
 
 
-class Encoded(Protocol):
-    @property
-    def encoding(self) -> str: ...
-
-
-T = TypeVar("T", bound=Encoded)
-
-
-class Operator(ABC, Generic[T]):
+class Operator(ABC):
     """Decodes every packet of one topic of the robot."""
 
     def __init__(self, port: int, metric: str) -> None:
         self.transport = client(f"operator-{metric}", port)
-        self.received: list[T] = []
+        self.received: list[Any] = []
         self.transport.subscribe(f"{BASE}/outgoing/{metric}", self.receive, qos=QoS.LATEST)
 
     @abstractmethod
     def receive(self, message: Message) -> None: ...
 
-    def wait(self, count: int, timeout: float = 20.0) -> list[T]:
+    def wait(self, count: int, timeout: float = 20.0) -> list[Any]:
         """Until so many packets more have come; returns these."""
         before = len(self.received)
         came = until(lambda: len(self.received) >= before + count, timeout)

@@ -8,10 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from pebble.contract import CAPABILITIES, STATUS, codec
-from pebble.contract.payloads import Capabilities
 from pebble.extensions.foxglove.media_feed import MAX_WAITING, MAX_WAITING_BYTES, MediaFeed
-from pebble.extensions.foxglove.robots import Robots
 from pebble.extensions.foxglove.server import MAX_BYTES, ChannelSpec, Server
 from pebble.extensions.media.packets import PBAT
 from pebble.extensions.media.picture_header import MAX_PAYLOAD
@@ -19,17 +16,11 @@ from pebble.extensions.media.scene import Scene
 from pebble.extensions.media.video import make_encoder
 from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.extensions.recordings.exports.foxglove_messages import Schemas
-from pebble.transports import Message
 from pebble.transports.memory import MemoryHub
-from tests.ext.page.media.robots import AUDIO, REF, VIDEO, PictureRobot, broker_on, status_of, until
+from tests.ext.page.media.robots import AUDIO, REF, VIDEO, broker_on
 
 ROBOT = RobotView(REF)
 ROBOT.capabilities = {"video": VIDEO, "audio": AUDIO}
-
-
-@pytest.fixture
-def anyio_backend() -> str:
-    return "asyncio"
 
 
 def pictures(count: int, keyframe_interval: int = 10) -> list[bytes]:
@@ -49,42 +40,6 @@ async def _feed(medium: str, payloads: list[bytes]) -> MediaFeed:
     for payload in payloads:
         feed.receive(payload)
     return feed
-
-
-class Watched(Server):
-    """Without a socket: clients have subscribed to all channels; what they are shown is remembered."""
-
-    def __init__(self) -> None:
-        super().__init__("test", lambda _topic, _on: None)
-        self.reported: list[str] = []
-
-    def declared(self, topic: str) -> bool:
-        return True
-
-    def subscribed(self, topic: str) -> bool:
-        return True
-
-    def report(self, text: str) -> None:
-        self.reported.append(text)
-
-
-@pytest.mark.anyio
-async def test_while_a_robot_holds_its_pictures_back_nothing_is_asked_of_it() -> None:
-    robot, server = PictureRobot(), Watched()
-    robot.mute = True
-    broker = broker_on(robot.hub)
-    await broker.open()
-    robots = Robots(broker, server, Schemas())
-    capabilities = Capabilities(t=1, value={"video": VIDEO})
-    robots.receive(Message(STATUS.topic(REF), status_of("held")), 0.0)
-    robots.receive(Message(CAPABILITIES.topic(REF), codec.encode(CAPABILITIES, capabilities)), 0.0)
-    await until(lambda: server.reported)
-    assert (server.reported[0].endswith(": Pictures wait for driving"), robot.published) == (True, [])
-    robots.receive(Message(STATUS.topic(REF), status_of("running")), 0.0)
-    await until(lambda: robot.requests)
-    await robots.close(5.0)
-    await broker.close()
-    robot.close()
 
 
 def feed(medium: str, payloads: list[bytes]) -> MediaFeed:

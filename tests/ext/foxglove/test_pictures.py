@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import re
 import signal
+import subprocess
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
-import av
 import cv2
 import numpy as np
 import pytest
 
-from tests.ext.foxglove.live import Live, client, live
-from tests.ext.foxglove.watcher import Watcher
+from tests.ext.foxglove.live import Live, Watcher, client, live, parser
 from tests.ext.page.media.robots import (
     AUDIO,
     CAMERA,
@@ -25,8 +28,9 @@ from tests.ext.page.media.robots import (
     SoundRobot,
     capabilities,
 )
+from tests.kit.npm import package
 from tests.kit.scene import read_counter
-from tests.support import Broker, some, until
+from tests.support import Broker, until
 
 H264, JPEG, SAMPLES = f"{CAMERA}/video", f"{CAMERA}/image", f"{SOUND}/sound"
 REQUESTED, WITHDRAWN = {"enabled": True, "encoding": "h264"}, {"enabled": False}
@@ -34,10 +38,8 @@ _nal_types = re.compile(rb"\x00\x00\x01(.)", re.DOTALL).findall
 
 
 @contextmanager
-def filming(
-    broker: Broker, *, fps: float = 15, size: tuple[int, int] = (160, 120), **video: Any
-) -> Iterator[PictureRobot]:
-    robot = PictureRobot({**VIDEO, **video}, fps=fps, size=size, transport=client(broker))
+def filming(broker: Broker, *, fps: float = 15, **video: Any) -> Iterator[PictureRobot]:
+    robot = PictureRobot({**VIDEO, **video}, fps=fps, size=(160, 120), transport=client(broker))
     try:
         yield robot
     finally:
@@ -46,19 +48,6 @@ def filming(
 
 def nal_types(unit: bytes) -> list[int]:
     return [byte[0] & 31 for byte in _nal_types(unit)]
-
-
-def decoded(image: Any) -> Any:
-    return cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_COLOR)
-
-
-def counters(pictures: list[Any]) -> list[int | None]:
-    return [read_counter(np.asarray(picture, np.uint8)) for picture in pictures]
-
-
-def follow_each_other(numbers: list[int | None]) -> bool:
-    known = [number for number in numbers if number is not None]
-    return len(known) == len(numbers) and known == list(range(known[0], known[0] + len(known)))
 
 
 def test_h264_is_requested_while_a_client_subscribes_and_passed_on_as_foxglove_expects_it(broker: Broker) -> None:
@@ -78,12 +67,6 @@ def test_h264_is_requested_while_a_client_subscribes_and_passed_on_as_foxglove_e
     assert all(unit.startswith(b"\x00\x00\x00\x01") for unit in units)
     assert [5 in nal_types(unit) for unit in units] == [{5, 7, 8} <= set(nal_types(unit)) for unit in units]
     assert 31 not in {kind for unit in units for kind in nal_types(unit)}  # the seal is ours
-    decoder = av.CodecContext.create("h264", "r")
-    decoder.options = {"flags": "+low_delay"}
-    shown = [decoder.decode(av.Packet(unit)) for unit in units]
-    assert {len(frames) for frames in shown} == {1}  # a picture in each message, which waits for no later one
-    assert {int(frame.pict_type) for (frame,) in shown} <= {1, 2}  # I and P: 3 is B
-    assert follow_each_other(counters([frame.to_ndarray(format="bgr24") for (frame,) in shown]))
     stamps = [video.timestamp.ToMilliseconds() for video in videos]
     assert stamps == sorted(stamps)
     assert all(
@@ -91,7 +74,7 @@ def test_h264_is_requested_while_a_client_subscribes_and_passed_on_as_foxglove_e
     )
 
 
-def test_a_client_that_comes_later_begins_with_a_key_frame(broker: Broker) -> None:
+def test_a_client_that_comes_later_begins_with_a_key_frame_and_sees_why_there_are_no_pictures(broker: Broker) -> None:
     with filming(broker) as robot, live(broker) as server:
         first, second = Watcher(server.address), Watcher(server.address)
         first.subscribe(H264)
@@ -99,52 +82,40 @@ def test_a_client_that_comes_later_begins_with_a_key_frame(broker: Broker) -> No
         second.subscribe(H264)
         assert until(lambda: any(5 in nal_types(video.data) for video in second.of(H264)), 20)
         assert {**REQUESTED, "keyframe": True} in robot.requests
-        second.close()
-        first.close()
+        robot.transport.publish(CAPABILITIES, capabilities({**VIDEO, "available": False}), retain=True)
+        assert until(lambda: second.statuses, 20)
+        assert second.statuses[0]["message"] == f"{CAMERA}: it has no camera"
         assert until(lambda: robot.requests[-1] == WITHDRAWN, 20)
 
 
-@pytest.mark.parametrize("encoding", ["json", "pbvd", "h264"])
-def test_pictures_of_every_encoding_become_jpegs(broker: Broker, encoding: str) -> None:
-    with filming(broker, encoding=encoding) as robot, live(broker) as server:
+def test_pictures_become_jpegs(broker: Broker) -> None:
+    with filming(broker, encoding="json") as robot, live(broker) as server:
         watcher = Watcher(server.address)
         watcher.subscribe(JPEG)
         assert until(lambda: watcher.count(JPEG) >= 12, 30)
         assert robot.requests[0] == {"enabled": True}  # as configured: what others see of it does not change
     images = watcher.of(JPEG)
     assert {(image.format, image.frame_id) for image in images} == {("jpeg", "goob")}
-    assert follow_each_other(counters(list(map(decoded, images))))
+    pictures = [cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_COLOR) for image in images]
+    numbers = [read_counter(np.asarray(picture, np.uint8)) for picture in pictures]
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
 
 
-@pytest.mark.parametrize("by", some([signal.SIGTERM, signal.SIGINT, signal.SIGHUP], 3))
-def test_a_signal_withdraws_the_requests(broker: Broker, by: signal.Signals) -> None:
+def test_a_signal_withdraws_the_requests(broker: Broker) -> None:
     with filming(broker) as robot:
         server = Live(broker)
         watcher = Watcher(server.address)
         watcher.subscribe(H264)
         assert until(lambda: watcher.count(H264), 30)
-        code, errors, seconds = server.end(by)
+        code, errors = server.end(signal.SIGTERM)
         assert (code, errors.splitlines()[1:]) == (0, [])
         assert errors.startswith("Showed 1 robots in ")
-        assert seconds < 5
         assert until(lambda: robot.requests[-1] == WITHDRAWN and robot.flags == [True, False])
         assert until(lambda: watcher.closed)
 
 
-def test_why_there_are_no_pictures_is_shown_in_foxglove(broker: Broker) -> None:
-    with filming(broker) as robot, live(broker) as server:
-        watcher = Watcher(server.address)
-        watcher.subscribe(H264)
-        assert until(lambda: watcher.count(H264), 30)
-        robot.transport.publish(CAPABILITIES, capabilities({**VIDEO, "available": False}), retain=True)
-        assert until(lambda: watcher.statuses, 20)
-        assert watcher.statuses[0]["message"] == f"{CAMERA}: it has no camera"
-        assert until(lambda: robot.requests[-1] == WITHDRAWN, 20)
-
-
-@pytest.mark.parametrize("encoding", ["pcm", "opus"])
-def test_sound_becomes_samples(broker: Broker, encoding: str) -> None:
-    robot = SoundRobot({**AUDIO, "encoding": encoding}, transport=client(broker))
+def test_sound_becomes_samples(broker: Broker) -> None:
+    robot = SoundRobot({**AUDIO, "encoding": "opus"}, transport=client(broker))
     try:
         with live(broker) as server:
             watcher = Watcher(server.address)
@@ -160,3 +131,30 @@ def test_sound_becomes_samples(broker: Broker, encoding: str) -> None:
         assert np.abs(samples).max() > 1000
     finally:
         robot.close()
+
+
+# -- Foxglove's own client, @foxglove/ws-protocol
+
+
+def watch(address: str, topic: str, count: int) -> dict[str, Any]:
+    package("@foxglove/ws-protocol")
+    watcher = Watcher(address)
+    assert until(lambda: topic in watcher.channels)
+    watcher.close()
+    command = ["node", str(Path(__file__).with_name("client.cjs")), address, topic, str(count)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
+
+
+def test_it_sees_compressed_video(broker: Broker) -> None:
+    with filming(broker) as robot, live(broker) as server:
+        found = watch(server.address, H264, 20)
+        assert until(lambda: robot.requests[-1] == WITHDRAWN, 20)
+    assert {H264, JPEG} <= set(found["topics"])
+    assert (found["info"]["name"], found["info"]["capabilities"]) == ("Pebble", [])
+    kind = parser(found["channel"])
+    videos = [kind.FromString(base64.b64decode(message["data"])) for message in found["messages"]]
+    assert {5, 7, 8} <= set(nal_types(videos[0].data))
+    assert all(abs(int(message["at"]) / 1e9 - time.time()) < 60 for message in found["messages"])

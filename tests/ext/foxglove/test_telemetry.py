@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import json
-import math
-import time
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
-from pebble.contract import APRILTAG_DATA, AUTONOMY_STATUS, CHARGING_LEVEL, LOGS
+from pebble.contract import (
+    CHANNELS,
+    CHARGING_LEVEL,
+    IMU,
+    LOGS,
+    OUTGOING,
+    STATUS,
+    Channel,
+)
 from pebble.contract.payloads import (
-    AutonomyStatus,
     ChargingLevel,
     LogRecord,
-    TagData,
 )
+from pebble.extensions.foxglove.json_channels import json_spec
 from pebble.transports import Message, QoS, Transport
-from tests.ext.foxglove.live import FRED, GOOB, client, live, online, publish
-from tests.ext.foxglove.watcher import Watcher
+from tests.ext.foxglove.live import FRED, GOOB, Watcher, client, live, online, publish
 from tests.support import Broker, until
 
 ONLINE, LEVEL = f"{GOOB}/outgoing/online", f"{GOOB}/outgoing/charging-level"
@@ -31,41 +36,13 @@ def robot(broker: Broker) -> Iterator[Transport]:
     robot.close()
 
 
-def now_ms() -> int:
-    return int(time.time() * 1000)
-
-
-def test_each_payload_gets_the_schema_that_foxglove_has_for_it(broker: Broker, robot: Transport) -> None:
-    """The messages themselves are tested where a recording is exported: they are the same."""
-    t = now_ms()
-    followed = TagData(detected=True, timestamp=t / 1e3, marker_id=7, distance_m=2.0, angle_rad=math.pi / 2)
-    record = LogRecord(t=t, level="WARNING", service="bridge", message="careful")
-    runs = AutonomyStatus(running=True, timestamp=t / 1e3, file="apriltag-follow", label="Follow a tag")
-    sent = {LOGS: record, APRILTAG_DATA: followed, AUTONOMY_STATUS: runs}
-    topics = [f"{GOOB}/outgoing/{name}" for name in ("logs/log", "apriltag-data", "autonomy-status/words")]
-    with live(broker) as server:
-        watcher = Watcher(server.address)
-
-        def publish_all() -> bool:
-            for channel, value in sent.items():
-                publish(robot, GOOB, channel, value)
-            return all(watcher.of(topic) for topic in topics)
-
-        publish_all()
-        for topic in topics:
-            watcher.subscribe(topic)
-        assert until(publish_all, 20, step=0.05)
-    log, data, words = (watcher.of(topic)[0] for topic in topics)
-    assert (log.level, log.name, log.message, log.timestamp.ToMilliseconds()) == (3, "bridge", "careful", t)
-    assert data["distance_m"] == 2.0
-    assert words == {"words": "goob drives itself: Follow a tag"}
-
-
-def test_json_has_the_schema_of_the_contract_and_its_last_value_for_who_subscribes_later(
+def test_each_value_has_its_schema_and_the_last_one_is_there_for_who_subscribes_later(
     broker: Broker, robot: Transport
 ) -> None:
+    """The messages of Foxglove's schemas are tested where a recording is exported: they are the same."""
     publish(robot, GOOB, CHARGING_LEVEL, ChargingLevel(value=7.4))
     robot.publish(f"{GOOB}/outgoing/diagnostics", b"[1, 2]", retain=True)
+    record = LogRecord(t=1_790_000_000_123, level="WARNING", service="bridge", message="careful")
     with live(broker) as server:
         first, second = Watcher(server.address), Watcher(server.address)
         first.subscribe(LEVEL)
@@ -74,10 +51,20 @@ def test_json_has_the_schema_of_the_contract_and_its_last_value_for_who_subscrib
         assert until(lambda: second.of(LEVEL))
         first.subscribe(f"{GOOB}/outgoing/diagnostics")
         assert until(lambda: first.of(f"{GOOB}/outgoing/diagnostics") == [{"value": [1, 2]}])
+        publish(robot, GOOB, LOGS, record)
+        first.subscribe(f"{GOOB}/outgoing/logs/log")
+
+        def logged() -> list[Any]:
+            publish(robot, GOOB, LOGS, record)
+            return first.of(f"{GOOB}/outgoing/logs/log")
+
+        assert until(logged, 20, step=0.05)
+        log = logged()[0]
     channel = first.channels[LEVEL]
     assert (channel["encoding"], channel["schemaName"]) == ("json", "pebble.ChargingLevel")
     assert json.loads(channel["schema"])["properties"]["value"] == {"type": "number"}
     assert second.of(LEVEL)[0]["value"] == 7.4
+    assert (log.level, log.name, log.message, log.timestamp.ToMilliseconds()) == (3, "bridge", "careful", record.t)
 
 
 def test_a_robot_that_comes_later_gets_its_channels_then_and_one_that_goes_keeps_them(
@@ -121,23 +108,6 @@ def test_clients_only_look(broker: Broker, robot: Transport) -> None:
     assert received == []
 
 
-def test_many_robots_at_once_do_not_lose_a_client(broker: Broker, robot: Transport) -> None:
-    metrics = ("online", "status", "charging-level", "charging-status")
-    topics = {f"pebble/robots/r{number}/outgoing/{metric}" for number in range(300) for metric in metrics}
-    with live(broker) as server:
-        watcher = Watcher(server.address)
-        assert until(lambda: watcher.info)
-
-        def shown() -> bool:
-            """A broker queues no more than 1,000 messages for a slow reader: what is missing comes again."""
-            for topic in topics - set(watcher.channels):
-                robot.publish(topic, b'{"t": 1}', qos=QoS.DELIVERED)
-            return topics <= set(watcher.channels)
-
-        assert until(shown, 30, step=0.5)
-        assert not watcher.closed
-
-
 def test_a_broker_that_goes_is_a_problem_in_foxglove_and_one_that_is_back_goes_on(
     broker: Broker, robot: Transport
 ) -> None:
@@ -156,3 +126,31 @@ def test_a_broker_that_goes_is_a_problem_in_foxglove_and_one_that_is_back_goes_o
             return {"t": 2} in watcher.of(ONLINE)
 
         assert until(published, 30, step=0.1)
+
+
+# -- the contract's schemas, in the part of JSON Schema that Foxglove reads
+
+TELEMETRY = [channel for channel in CHANNELS if channel.direction == OUTGOING and channel.payload is not bytes]
+
+
+def check(schema: dict[str, Any]) -> None:
+    """Parses as foxglove/studio does (packages/mcap-support/src/parseJsonSchema.ts), which refuses everything else."""
+    assert schema["type"] == "object"
+    for field in schema["properties"].values():
+        items = field["items"] if field["type"] == "array" else field
+        assert items["type"] in ("boolean", "string", "number", "integer", "object")
+        if items["type"] == "object":
+            check(items)
+
+
+@pytest.mark.parametrize("channel", TELEMETRY, ids=lambda channel: channel.suffix)
+def test_foxglove_reads_every_schema(channel: Channel) -> None:
+    spec = json_spec("topic", channel)
+    assert (spec.encoding, spec.schema_encoding) == ("json", "jsonschema")
+    check(json.loads(spec.schema or b'{"type": "object", "properties": {}}'))
+
+
+def test_a_payload_that_no_schema_covers_may_be_any_json() -> None:
+    assert json_spec("topic", STATUS)[2:] == ("pebble.Any", "jsonschema", b"")
+    assert json_spec("topic", None)[2:] == ("pebble.Any", "jsonschema", b"")
+    assert "orientation_deg" in json.loads(json_spec("topic", IMU).schema)["properties"]["value"]["properties"]

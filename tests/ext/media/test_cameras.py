@@ -56,6 +56,7 @@ def filming(env: dict[str, str]) -> Iterator[Filming]:
     filming.close()
 
 
+@needs_shared_memory
 def test_pictures_of_a_robot_by_its_id_its_base_topic_its_run_directory_and_its_config(
     filming: Filming, env: dict[str, str], tmp_path: Path
 ) -> None:
@@ -66,13 +67,8 @@ def test_pictures_of_a_robot_by_its_id_its_base_topic_its_run_directory_and_its_
             picture = next(pictures)
             assert (picture.shape, picture[5, 5].tolist()) == ((HEIGHT, WIDTH, 3), [10, 20, 30])
             picture[:] = 0  # it is ours
-
-
-@needs_shared_memory
-def test_views_are_the_cameras_own_memory(filming: Filming, env: dict[str, str]) -> None:
     with camera("goob", env=env, views=True, timeout=5) as pictures:
-        picture = next(pictures)
-        assert not picture.flags.writeable
+        assert not next(pictures).flags.writeable, "it is the camera's own memory"
         assert pictures.frame is not None
         assert pictures.frame.valid()
         assert pictures.frame.info.captured_ns > 0

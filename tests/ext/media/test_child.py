@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
-from pebble.extensions.media.child import tied_to_parent
+from pebble.extensions.media.child import Child, tied_to_parent
 from tests.support import ROOT, gone, until
 
 PARENT = """
 import signal, subprocess, sys, time
-from pebble.extensions.media.child import tied_to_parent
+from pebble.extensions.media.child import Child, tied_to_parent
 child = subprocess.Popen(tied_to_parent([sys.executable, "-c", "import time; time.sleep(100)"], signal.SIGTERM))
 print(child.pid, flush=True)
 time.sleep(100)
@@ -34,6 +33,8 @@ def test_a_child_goes_when_its_parent_is_killed() -> None:
     assert until(lambda: gone(child))
 
 
-def test_a_program_that_is_not_there_is_named_before_anything_starts() -> None:
-    with pytest.raises(FileNotFoundError, match="no-such-program"):
-        tied_to_parent(["no-such-program", "--help"])
+def test_what_a_program_leaves_behind_ends_with_it() -> None:
+    program = Child(["sh", "-c", "sleep 60 & echo $!"], dict(os.environ), stdout=subprocess.PIPE)
+    left = int(program.pipe("stdout").readline())
+    assert program.wait() == 0
+    assert until(lambda: gone(left))

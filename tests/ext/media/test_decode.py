@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
+import random
 import struct
 import zlib
 from collections.abc import Callable
@@ -18,11 +18,9 @@ from pebble.extensions.media.jpeg import decode_jpeg, jpeg_size
 from pebble.extensions.media.json_video import inflate
 from pebble.extensions.media.packets import Picture, PictureKind
 from pebble.extensions.media.video import make_encoder
-from tests.ext.recordings.demo_robots import FRED, MEDIA, recorded
-from tests.kit.scene import read_counter
+from tests.support import cases
 
 T0 = 1_710_969_600_000
-FORMS = ("json", "pbvd", "h264")
 
 
 def picture(number: int, width: int = 64, height: int = 48) -> np.ndarray:
@@ -42,52 +40,32 @@ def frames(decoder: VideoDecoder, packets: list[bytes]) -> list[int | None]:
 
 
 Sent = Callable[[list[bytes], list[bytes]], list[bytes]]
+#: The same of json and pbvd is in tests/vectors/video.json.
 SHOWN: dict[str, tuple[Sent, list[int | None]]] = {
-    "a lost frame": (lambda old, _: old[:3] + old[4:6], [0, 1, 2, None, None]),
     "a lost frame, and a key frame after it": (lambda old, _: old[:3] + old[4:8], [0, 1, 2, None, None, 6, 7]),
-    "a frame lost before a key frame": (lambda old, _: old[:5] + old[6:8], [0, 1, 2, 3, 4, 6, 7]),
     "joined between key frames": (lambda old, _: old[3:8], [None, None, None, 6, 7]),
-    "a sender that began again": (
-        lambda old, new: [*old[:5], new[1], *new[6:8], *new[:2]],
-        [0, 1, 2, 3, 4, None, 6, 7, 0, 1],
-    ),
+    "a sender that began again": (lambda old, new: [*old[:5], new[1], *new[6:8]], [0, 1, 2, 3, 4, None, 6, 7]),
     "a new sender whose number fits, by its time": (
-        lambda old, new: [*old[:3], *new[3:8]],
-        [0, 1, 2, None, None, None, 6, 7],
+        lambda old, new: [*old[:3], *new[3:6]],
+        [0, 1, 2, None, None, None],
     ),
 }
 
 
-@pytest.mark.parametrize("name", FORMS)
 @pytest.mark.parametrize(("sent", "shown"), SHOWN.values(), ids=SHOWN)
 @pytest.mark.parametrize("later_ms", [8000, -1000])
-def test_what_is_shown(name: str, sent: Sent, shown: list[int | None], later_ms: int) -> None:
+def test_what_is_shown(sent: Sent, shown: list[int | None], later_ms: int) -> None:
     decoder = VideoDecoder()
     assert not decoder.wants_keyframe
-    assert frames(decoder, sent(stream(name), stream(name, start_ms=T0 + later_ms, first=3))) == shown
+    assert frames(decoder, sent(stream("h264"), stream("h264", start_ms=T0 + later_ms, first=3))) == shown
     assert decoder.wants_keyframe is (shown[-1] is None)
 
 
-@pytest.mark.parametrize("name", FORMS)
-@pytest.mark.parametrize("bad", [b"", b"\x00", b"{", b"PBVD", b"\xff\xd8", b"PBVD\x01\x09" + bytes(40), b"[]", b"null"])
-def test_anything_refused_breaks_the_chain(name: str, bad: bytes) -> None:
-    packets, decoder = stream(name), VideoDecoder()
+@pytest.mark.parametrize("bad", [b"", b"{", b"\xff\xd8", b"PBVD\x01\x09" + bytes(40)])
+def test_anything_refused_breaks_the_chain(bad: bytes) -> None:
+    packets, decoder = stream("h264"), VideoDecoder()
     assert frames(decoder, [*packets[:2], bad, *packets[2:7]]) == [0, 1, None, None, None, None, None, 6]
     assert decoder.problem
-
-
-def test_a_recorded_camera_counts_its_pictures_in_every_form() -> None:
-    """The number that the simulated camera draws into its pictures grows by one with each, whatever the form."""
-    packets, decoder = recorded(MEDIA, f"{FRED}/outgoing/front-camera"), VideoDecoder()
-    shown = [decoder.feed(packet) for packet in packets]
-    seen = [one for one in shown if one is not None]
-    assert len(seen) == len(packets) > 80
-    forms = ["json", "pbvd", "pbvz", "h264"]
-    assert list(dict.fromkeys(one.encoding for one in seen)) == forms
-    for name in forms:
-        counts = [read_counter(one.picture) for one in seen if one.encoding == name]
-        assert None not in counts
-        assert all(0 < after - before <= 2 for before, after in itertools.pairwise(counts)), name
 
 
 def test_raw_jpeg_is_a_key_frame_without_number_and_time() -> None:
@@ -129,10 +107,8 @@ def test_the_picture_belongs_to_the_caller() -> None:
         ("1710969600.123", 1710969600123),
         ("1710969600123", 1710969600123),
         ("null", None),
-        ("-1", None),
         ("0", None),
         ("1e300", None),
-        ("-1e308", None),
     ],
 )
 def test_stamps(stamp: str, captured_ms: int | None) -> None:
@@ -148,15 +124,10 @@ def test_stamps(stamp: str, captured_ms: int | None) -> None:
         (b'"id":0', b'"id":' + b"9" * 400),
         (b'"id":0', b'"id":-1'),
         (b'"id":0', b'"id":0.5'),
-        (b'"id":0', b'"id":true'),
-        (b'"id":0', b'"id":"0"'),
         (b'"id":0', b'"id":0,"more":' + b"[" * 100_000),
         (b'"keyframe":true', b'"keyframe":1'),
-        (b'"keyframe":true', b'"keyframe":null'),
         (b'"timestamp":1710969600.0', b'"timestamp":NaN'),
-        (b'"timestamp":1710969600.0', b'"timestamp":Infinity'),
         (b'"data":"', b'"data":"!'),
-        (b'"data":"', b'"data":"A'),
         (b'"data":"', b'"data":null,"date":"'),
     ],
 )
@@ -169,7 +140,7 @@ def test_json_that_is_none_of_ours(was: bytes, now: bytes) -> None:
 
 
 def test_what_is_too_large_is_refused_before_it_is_decoded() -> None:
-    bomb = zlib.compress(bytes(64 << 20), 9)
+    bomb = zlib.compress(bytes(16 << 20), 1)
     decoder = VideoDecoder()
     assert frames(decoder, [Picture(PictureKind.ZLIB_JPEG, 0, T0, bomb).pack(), bytes(MAX_PAYLOAD + 1)]) == [None, None]
     with pytest.raises(PayloadError, match="more than 1000"):
@@ -186,10 +157,8 @@ def test_what_is_too_large_is_refused_before_it_is_decoded() -> None:
     "options",
     [
         [cv2.IMWRITE_JPEG_PROGRESSIVE, 1],
-        [cv2.IMWRITE_JPEG_OPTIMIZE, 1],
         [cv2.IMWRITE_JPEG_RST_INTERVAL, 2],
         [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_411],
-        [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444],
     ],
 )
 def test_every_jpeg_a_camera_may_send(options: list[int]) -> None:
@@ -198,3 +167,34 @@ def test_every_jpeg_a_camera_may_send(options: list[int]) -> None:
     assert decode_jpeg(jpeg).shape == (121, 161, 3)
     grey = cv2.imencode(".jpg", picture(0)[:, :, 0], options[:2])[1].tobytes()
     assert decode_jpeg(grey).shape == (48, 64, 3)
+
+
+def hostile(chance: random.Random, packet: bytes) -> bytes:
+    """Cut off, garbage, or with other bits behind its header."""
+    kind, made = chance.randrange(3), bytearray(packet)
+    if kind == 0:
+        return packet[: chance.choice([chance.randrange(len(packet)), len(packet) - 1])]
+    if kind == 1:
+        begin = chance.choice([b"", b"{", b'{"id":', b"PBVD\x01\x01\x00", b"PBVD\x01\x05\x01", b"\xff\xd8\xff"])
+        return begin + chance.randbytes(chance.randint(0, 300))
+    for _ in range(chance.randint(1, 8)):
+        made[chance.randrange(19, len(made))] ^= 1 << chance.randrange(8)
+    return bytes(made)
+
+
+@pytest.mark.parametrize("name", ["json", "pbvd", "h264"])
+def test_hostile_packets(name: str) -> None:
+    """Among good ones: never a crash, and never a wrong picture where a checksum tells."""
+    chance, packets, honest = random.Random(name), stream(name, 36), VideoDecoder()
+    right = [shown.picture for shown in map(honest.feed, packets) if shown is not None]
+    decoder, at = VideoDecoder(), 0
+    for _ in range(cases(700, 30_000)):
+        is_hostile = chance.random() < 0.4
+        shown = decoder.feed(hostile(chance, packets[at]) if is_hostile else packets[at])
+        assert decoder.wants_keyframe is (shown is None)
+        if shown is not None and name != "pbvd":
+            assert np.array_equal(shown.picture, right[at])
+        at = (at + chance.choices([0 if is_hostile else 1, 1, 3], [4, 4, 1])[0]) % len(packets)
+    again = [decoder.feed(packet) for packet in packets]
+    assert all(np.array_equal(shown.picture, picture) for shown, picture in zip(again, right, strict=True) if shown)
+    assert all(again[6:])

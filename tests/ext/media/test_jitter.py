@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import random
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -16,7 +15,6 @@ from pebble.extensions.media.packets import Codec, Sound
 from pebble.extensions.media.pcm import to_bytes
 from pebble.extensions.media.sound import make_sound_encoder
 from pebble.extensions.media.speech import Speech
-from tests.ext.recordings.demo_robots import FRED, MEDIA, messages
 
 RATE = 16000
 CHUNK = 320  # 20 ms
@@ -87,7 +85,7 @@ def on_time(count: int, *, first: int = 0, **more: Any) -> list[tuple[float, byt
 # -- all is well
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_jitter_below_the_target_is_inaudible(seed: int) -> None:
     """Also where numbers wrap to 1, and where packets come twice or in another order."""
     randoms = random.Random(seed)
@@ -105,25 +103,6 @@ def test_jitter_below_the_target_is_inaudible(seed: int) -> None:
     assert buffer.counters["lost"] == buffer.counters["restarts"] == 0
 
 
-def recorded_sound() -> list[tuple[float, bytes]]:
-    """A robot's packets in PCM, with the times at which they really arrived."""
-    packets = [one for one in messages(MEDIA) if one.channel.topic == f"{FRED}/outgoing/audio"]
-    return [((one.log_ns - packets[0].log_ns) / 1e9, one.payload) for one in packets if one.payload[5] == Codec.PCM16LE]
-
-
-def test_recorded_sound_is_played_evenly_at_its_recorded_jitter() -> None:
-    arrivals = recorded_sound()
-    longest_s = max(later - earlier for (earlier, _), (later, _) in itertools.pairwise(arrivals))
-    assert longest_s > 0.08, "more than the buffer waits at first"
-    played = play(JitterBuffer(), arrivals)
-    sent = b"".join(payload[24:] for _, payload in arrivals)
-    first = b"".join(chunk.pcm for _, chunk in played.chunks[:10])
-    assert first == sent[: len(first)]
-    assert sum(not chunk.concealed for _, chunk in played.chunks) >= len(arrivals) - 2, "what waited too long"
-    assert played.stutters == 0
-    assert played.concealed_s < longest_s + 0.1, "the end of the sound is concealed for 0.1 s"
-
-
 def test_jitter_above_the_target_is_learnt() -> None:
     randoms = random.Random(3)
     arrivals = [(at + randoms.choice([0, 0.01, 0.13]), raw) for at, raw in on_time(2000)]
@@ -138,7 +117,7 @@ def test_jitter_above_the_target_is_learnt() -> None:
 # -- gaps
 
 
-@pytest.mark.parametrize("lost", [1, 2, 3, 4, 5])
+@pytest.mark.parametrize("lost", [1, 5])
 def test_a_short_gap_is_filled_and_costs_no_time(lost: int) -> None:
     buffer = JitterBuffer()
     arrivals = [arrival for index, arrival in enumerate(on_time(60)) if not 20 <= index < 20 + lost]
@@ -150,7 +129,7 @@ def test_a_short_gap_is_filled_and_costs_no_time(lost: int) -> None:
     assert buffer.counters["lost"] == lost
 
 
-@pytest.mark.parametrize("concealment_ms", [0, 1, 50, 100, 130])
+@pytest.mark.parametrize("concealment_ms", [0, 50, 130])
 def test_when_the_sender_stops_there_is_an_end(concealment_ms: int) -> None:
     buffer = JitterBuffer(concealment_ms=concealment_ms)
     played = play(buffer, on_time(20))
@@ -185,7 +164,7 @@ def test_opus_conceals_with_its_own_means_and_no_longer_than_allowed() -> None:
 # -- the sender
 
 
-@pytest.mark.parametrize("before", [3, 7, 50, 500])
+@pytest.mark.parametrize("before", [3, 50])
 def test_a_restarted_sender_is_played_at_once(before: int) -> None:
     again = [
         (0.02 * before + 0.5 + at, packet(index + before, sequence=index + 1))
@@ -207,7 +186,7 @@ def test_a_restarted_sender_whose_clock_tells_nothing_is_played_soon(before: int
 
 
 @pytest.mark.parametrize(
-    ("sequence", "of", "expected"), [(2, 1, 1), (1, 2, -1), (1, LAST, 1), (LAST, 1, -1), (5, 5, 0), (1, LAST - 1, 2)]
+    ("sequence", "of", "expected"), [(2, 1, 1), (1, LAST, 1), (LAST, 1, -1), (5, 5, 0), (1, LAST - 1, 2)]
 )
 def test_ahead(sequence: int, of: int, expected: int) -> None:
     assert ahead(sequence, of) == expected
@@ -252,9 +231,8 @@ def _with_index(played: Played) -> list[tuple[tuple[float, Chunk], int]]:
     return [((at, chunk), int(chunk.samples[-1, 0])) for at, chunk in played.chunks if not chunk.concealed]
 
 
-@pytest.mark.parametrize("drift", [0.001, 0.0002])
-def test_a_sender_whose_clock_is_fast_adds_no_latency(drift: float) -> None:
-    count = 15_000  # five minutes
+def test_a_sender_whose_clock_is_fast_adds_no_latency() -> None:
+    drift, count = 0.001, 6_000  # two minutes
     arrivals = [(at / (1 + drift), raw) for at, raw in on_time(count)]
     buffer = JitterBuffer()
     played = play(buffer, arrivals)
@@ -265,13 +243,13 @@ def test_a_sender_whose_clock_is_fast_adds_no_latency(drift: float) -> None:
 
 
 def test_a_sender_whose_clock_is_slow_is_stretched() -> None:
-    count = 15_000
+    count = 6_000
     arrivals = [(at * 1.001, raw) for at, raw in on_time(count)]
     buffer = JitterBuffer()
     played = play(buffer, arrivals)
     assert played.real == list(range(count))
     assert played.stutters == 0
-    assert played.concealed_s == pytest.approx(0.001 * 0.02 * count, abs=0.2)
+    assert played.concealed_s == pytest.approx(0.001 * 0.02 * count, abs=0.08)
 
 
 def test_a_player_that_takes_late_is_not_flooded() -> None:
@@ -316,15 +294,15 @@ def hostile(randoms: random.Random, good: list[bytes]) -> bytes:
     return bytes(raw[: randoms.randrange(len(raw) + 1)] if choice > 0.9 else raw)
 
 
-def storm(seed: int, count: int) -> JitterBuffer:
-    """``count`` hostile packets into a buffer that is being played; afterwards an honest sender must be heard."""
-    randoms = random.Random(seed)
+def test_hostile_packets() -> None:
+    """They come into a buffer that is being played; afterwards an honest sender must be heard."""
+    randoms = random.Random(1)
     recorded = to_bytes(Speech(RATE).samples(0, RATE))
     good = make_sound_encoder("pcm", rate=RATE, channels=1).encode(recorded, EPOCH_MS)
     good += make_sound_encoder("opus", rate=RATE, channels=1, bundle=2).encode(recorded, EPOCH_MS)
     buffer = JitterBuffer(limit=20)
     now = 0.0
-    for _ in range(count):
+    for _ in range(1500):
         now += randoms.choice([0, 0.001, 0.02, 0.3])
         buffer.put(hostile(randoms, good), now)
         assert len(buffer) <= 20
@@ -334,10 +312,5 @@ def storm(seed: int, count: int) -> JitterBuffer:
     honest = [(now + 0.02 * index, packet(index, ms=2**63)) for index in range(200)]
     played = play(buffer, honest)
     assert played.real[-150:] == list(range(50, 200))
-    return buffer
-
-
-def test_hostile_packets() -> None:
-    counted = storm(1, 3000).counters.snapshot()
-    assert counted["refused"] > 300
-    assert counted["packets"] > 300
+    assert buffer.counters["refused"] > 150
+    assert buffer.counters["packets"] > 150

@@ -25,7 +25,7 @@ from pebble.extensions.media.sound import (
     unpack,
 )
 from pebble.extensions.media.speech import Speech
-from tests.support import some
+from tests.kit.sound import envelope
 from tests.vectors import make_pbat
 
 VECTORS: list[dict[str, Any]] = json.loads(make_pbat.FILE.read_text())
@@ -54,12 +54,9 @@ def joined(sounds: list[ReceivedSound]) -> Samples:
     return np.concatenate([one.samples for one in sounds])
 
 
-def envelope(samples: Samples, rate: int) -> Any:
-    step = rate // 50
-    return np.sqrt((samples[: len(samples) // step * step, 0].astype(float).reshape(-1, step) ** 2).mean(axis=1))
-
-
-def likeness(first: Any, second: Any) -> float:
+def likeness(heard: Samples, heard_hz: int, said: Samples, said_hz: int) -> float:
+    """How alike the loudness of the first channels is."""
+    first, second = (envelope(of[:, 0].astype(float), hz) for of, hz in ((heard, heard_hz), (said, said_hz)))
     count = min(len(first), len(second))
     return float(np.corrcoef(first[:count], second[:count])[0, 1])
 
@@ -72,15 +69,10 @@ def test_vectors(vector: dict[str, Any]) -> None:
     assert found == expected
 
 
-def test_the_vectors_are_up_to_date() -> None:
-    assert make_pbat.vectors() == VECTORS, "run: python -m tests.vectors.make_pbat"
-
-
 # -- PCM
 
 
-@pytest.mark.parametrize("feed", [1, 100, 320, 321, 5000])
-@pytest.mark.parametrize("channels", [1, 2])
+@pytest.mark.parametrize(("feed", "channels"), [(1, 1), (321, 2), (5000, 1)])
 def test_pcm_is_exact_whatever_the_pieces(feed: int, channels: int) -> None:
     recorded = speech(16000, channels)[:8000]
     sounds = received(packets("pcm", recorded, 16000, feed=feed))
@@ -101,7 +93,7 @@ def test_other_rate_and_channels_than_captured() -> None:
     recorded = speech(48000, 2)
     sounds = received(packets("pcm", recorded, 48000, feed=960, sent_rate=16000, sent_channels=1))
     assert {(one.rate, one.channels, len(one.samples)) for one in sounds} == {(16000, 1, 320)}
-    assert likeness(envelope(joined(sounds), 16000), envelope(recorded, 48000)) > 0.98
+    assert likeness(joined(sounds), 16000, recorded, 48000) > 0.98
 
 
 @pytest.mark.parametrize(("name", "before", "after"), [("pcm", 200, 640), ("opus", 1280, 1920)])
@@ -115,29 +107,18 @@ def test_a_hole_in_what_is_captured_is_no_part_of_a_packet_or_bundle(name: str, 
 # -- Opus
 
 
-@pytest.mark.parametrize("rate", some([16000, 8000, 12000, 48000, 24000], 3))
-@pytest.mark.parametrize("channels", [1, 2])
-def test_opus_sounds_the_same(rate: int, channels: int) -> None:
-    recorded = speech(rate, channels)
-    sounds = received(packets("opus", recorded, rate))
-    assert {(one.rate, one.channels, len(one.samples), one.encoding) for one in sounds} == {
-        (rate, channels, rate // 50, "opus")
-    }
-    assert likeness(envelope(joined(sounds), rate), envelope(recorded, rate)) > 0.9
-
-
-@pytest.mark.parametrize(("captured", "sent"), [(44100, 48000), (22050, 24000), (11025, 12000), (32000, 48000)])
-def test_opus_of_other_rates(captured: int, sent: int) -> None:
-    recorded = speech(captured)
+@pytest.mark.parametrize(("captured", "sent", "channels"), [(16000, 16000, 1), (48000, 48000, 2), (22050, 24000, 1)])
+def test_opus_sounds_the_same(captured: int, sent: int, channels: int) -> None:
+    recorded = speech(captured, channels)
     sounds = received(packets("opus", recorded, captured, feed=captured // 50))
-    assert {one.rate for one in sounds} == {sent}
-    assert likeness(envelope(joined(sounds), sent), envelope(recorded, captured)) > 0.9
+    assert {(one.rate, one.channels, len(one.samples), one.encoding) for one in sounds} == {
+        (sent, channels, sent // 50, "opus")
+    }
+    assert likeness(joined(sounds), sent, recorded, captured) > 0.9
 
 
-@pytest.mark.parametrize("chunk_ms", [1, 20, 30, 60, 1000])
-@pytest.mark.parametrize("bundle", some([3, 1, 2], 3))
-def test_bundles(chunk_ms: int, bundle: int) -> None:
-    part_ms = {1: 20, 20: 20, 30: 40, 60: 60, 1000: 60}[chunk_ms]
+@pytest.mark.parametrize(("chunk_ms", "part_ms", "bundle"), [(1, 20, 3), (30, 40, 1), (1000, 60, 3)])
+def test_bundles(chunk_ms: int, part_ms: int, bundle: int) -> None:
     raw = packets("opus", speech(16000), 16000, chunk_ms=chunk_ms, bundle=bundle)
     unpacked = list(map(unpack, raw))
     assert {one.samples for one in unpacked} == {16 * part_ms * bundle}
@@ -204,21 +185,21 @@ def test_hostile_packets() -> None:
     randoms = random.Random(5)
     good = packets("pcm", speech(16000)[:1600], 16000) + packets("opus", speech(16000)[:6400], 16000, bundle=2)
     decoder = SoundDecoder()
-    for _ in range(4000):
+    for _ in range(1500):
         raw = bytearray(randoms.choice(good))
         for _ in range(randoms.randrange(1, 6)):
             raw[randoms.randrange(len(raw))] = randoms.randrange(256)
         decoder.feed(bytes(raw[: randoms.randrange(len(raw) + 1)] if randoms.random() < 0.3 else raw))
     counted = decoder.counters.snapshot()
-    assert counted["packets"] + counted["refused"] == 4000
-    assert min(counted.values()) > 100
+    assert counted["packets"] + counted["refused"] == 1500
+    assert min(counted.values()) > 40
     after = [decoder.feed(raw) for raw in good[:5]]
     assert all(one is not None for one in after)
 
 
 def test_hostile_bodies_of_opus() -> None:
     randoms = random.Random(6)
-    for _ in range(4000):
+    for _ in range(1500):
         body = randoms.randbytes(randoms.randrange(40))
         try:
             parts = opus.split(body)
@@ -230,9 +211,7 @@ def test_hostile_bodies_of_opus() -> None:
 # -- samples
 
 
-@pytest.mark.parametrize(
-    ("rate", "wanted"), [(48000, 16000), (16000, 48000), (44100, 48000), (48000, 48000), (44099, 16000)]
-)
+@pytest.mark.parametrize(("rate", "wanted"), [(48000, 16000), (48000, 48000), (44099, 16000)])
 def test_resampling_keeps_a_tone(rate: int, wanted: int) -> None:
     def tone(of: int) -> Any:
         return 10_000 * np.sin(2 * np.pi * 440 * np.arange(of) / of)

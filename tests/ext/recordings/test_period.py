@@ -22,16 +22,11 @@ def ns(text: str) -> int:
     ("since", "expected"),
     [
         ("10:00", "2026-11-20T10:00Z"),
-        ("9:05", "2026-11-20T09:05Z"),
-        ("12:30", "2026-11-20T12:30Z"),
         ("12:30:01", "2026-11-19T12:30:01Z"),  # the latest one is yesterday's
         ("2026-11-18", "2026-11-18T00:00Z"),
-        ("2026-11-18T10:00", "2026-11-18T10:00Z"),
         ("2026-11-18 10:00:30", "2026-11-18T10:00:30Z"),
         ("2026-11-18T10:00+02:00", "2026-11-18T08:00Z"),
-        ("2027-01-01", "2027-01-01T00:00Z"),
         ("-90s", "2026-11-20T12:28:30Z"),
-        ("-2h", "2026-11-20T10:30Z"),
         ("-3d", "2026-11-17T12:30Z"),
         (" 10:00 ", "2026-11-20T10:00Z"),
     ],
@@ -43,18 +38,14 @@ def test_since(since, expected):
 @pytest.mark.parametrize(
     ("since", "until", "expected"),
     [
-        ("10:00", "11:00", "2026-11-20T11:00Z"),
         ("10:00", "13:00", "2026-11-20T13:00Z"),  # may be later than now
         ("22:00", "06:00", "2026-11-20T06:00Z"),  # from yesterday
         ("10:00", "10:00", "2026-11-21T10:00Z"),
         ("10:00", "+5m", "2026-11-20T10:05Z"),
-        ("2026-11-18T23:00", "+90m", "2026-11-19T00:30Z"),
         ("2026-11-18", "2026-11-18", "2026-11-19T00:00Z"),  # the whole day
         ("2026-11-18", "2026-11-18T10:00", "2026-11-18T10:00Z"),
         ("-2h", "-1h", "2026-11-20T11:30Z"),
-        (None, "11:00", "2026-11-20T11:00Z"),
         (None, "13:00", "2026-11-19T13:00Z"),
-        (None, "-1h", "2026-11-20T11:30Z"),
     ],
 )
 def test_until(since, until, expected):
@@ -88,10 +79,8 @@ def machine_in_berlin():
     ("since", "until", "expected"),
     [
         ("10:00 UTC", "+1h", "2026-11-20T10:00Z"),
-        ("10:00Z", "+1h", "2026-11-20T10:00Z"),
         ("10:00+02:00", "+1h", "2026-11-20T08:00Z"),
         ("2026-07-01 10:00 America/New_York", "+1h", "2026-07-01T14:00Z"),
-        ("2026-07-01 Europe/Berlin", "+1h", "2026-06-30T22:00Z"),
         ("2026-07-01T10:00", "+1h", "2026-07-01T08:00Z"),
         ("2026-10-25T02:30+01:00", "03:00", "2026-10-25T01:30Z"),
         ("2026-10-25T02:30", "03:00", "2026-10-25T00:30Z"),  # twice that day: the first one
@@ -108,19 +97,13 @@ def test_a_time_is_that_of_its_zone_on_its_day(since, until, expected, local):
     ("since", "until", "message"),
     [
         ("25:00", None, '--since "25:00" is no time: write 10:00,'),
-        ("yesterday", None, '--since "yesterday" is no time'),
         ("2026-02-30", None, "2026-02-30"),
-        ("", None, "is no time"),
         ("\u0661\u0660:\u0660\u0660", None, "is no time"),
-        ("10", None, "is no time"),
         ("+5m", None, "is in the future: write -5m"),
         (None, "+5m", "counts from --since"),
-        (None, "soon", '--until "soon" is no time'),
-        ("10:00 Nowhere/Town", None, '"10:00 Nowhere/Town" is no time'),
         ("10:00 ../../etc/passwd", None, "is no time"),
         (None, "24:61", "+5m or -1h"),
         ("2026-11-20", "2026-11-19", "--until 2026-11-19 is not after --since 2026-11-20"),
-        ("-1h", "-2h", "is not after"),
         ("10:00", "+0s", "is not after"),
         (None, "1960-01-01", "is before 1970"),
     ],
@@ -132,11 +115,11 @@ def test_what_is_wrong_is_explained_in_a_line(since, until, message):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("since", ["0001-01-01", "0001-01-01T00:00+14:00", "-999999999d", "1969-12-31"])
+@pytest.mark.parametrize("since", ["0001-01-01T00:00+14:00", "-999999999d", "1969-12-31"])
 def test_before_1970_is_1970(since):
     assert parse_period(since, None, now=NOW)[0] == 0
 
 
-@pytest.mark.parametrize("until", ["9999-12-31", "9999-12-31T23:59-12:00", "+999999999d", "2600-01-01"])
+@pytest.mark.parametrize("until", ["9999-12-31T23:59-12:00", "+999999999d", "2600-01-01"])
 def test_what_is_too_late_for_a_recording_is_the_end_of_time(until):
     assert parse_period("10:00", until, now=NOW)[1] == FOREVER_NS

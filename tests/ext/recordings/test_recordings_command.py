@@ -50,26 +50,6 @@ def test_list_and_info(folder: Path, run: Run) -> None:
     assert "gap: why no connection, lasted 60.0 s" in run.out
 
 
-def test_info_counts_what_is_in_the_period(folder: Path, run: Run) -> None:
-    assert run("recordings", "info", folder, "--since", "2000-01-01", "--until", "2000-01-02") == 0
-    assert "goob" not in run.out
-    topics = "a/b/c/outgoing/", "/b/c/outgoing/online", "a/b/c/outgoing/online"
-    with (folder / "other.mcap").open("wb", buffering=0) as file:
-        writer = RecordingWriter(file, library="other")
-        for topic in topics:
-            writer.add(writer.channel(topic, "json", {}), START_NS, b"{}")
-        writer.channel("a/b/unused/outgoing/online", "json", {})
-        writer.finish()
-    assert run("recordings", "info", folder / "other.mcap") == 0
-    assert re.findall(r"^(\S+): 1 messages", run.out, re.M) == ["a/b/c"]
-
-
-def test_a_period_is_shown_before_it_is_deleted(folder: Path, run: Run) -> None:
-    period = ("--since", "2026-07-01 10:00 UTC", "--until", "+1h")
-    assert run("recordings", "rm", folder, *period, "--yes") == 0
-    assert "2026-07-01 10:00:00 UTC to 2026-07-01 11:00:00 UTC" in run.out
-
-
 def test_search(folder: Path, run: Run) -> None:
     run("recordings", "search", folder, "--robot", "goob", "--topic", "outgoing/logs", "--text", "battery")
     (line,) = run.out.splitlines()
@@ -92,20 +72,12 @@ def test_lines_there_and_back(folder: Path, tmp_path: Path, run: Run) -> None:
 
 def test_an_import_in_another_order_is_read_in_that_of_time(tmp_path: Path, run: Run) -> None:
     lines, made = tmp_path / "a.jsonl", tmp_path / "a.mcap"
-    numbers = [3, 1, 2, *range(40_000, 10, -1)]
+    numbers = [3, 1, 2, *range(20_000, 10, -1)]
     line = '{"timestamp": %d, "topic": "pebble/robots/goob/outgoing/online", "payload_b64": ""}'
     lines.write_text("\n".join(line % number for number in numbers))
     assert run("recordings", "import", lines, made) == 0
     read = [one.log_ns for one in library.merged([made])]
     assert read == sorted(number * 10**9 for number in numbers)
-
-
-def test_one_robot_is_deleted(folder: Path, run: Run) -> None:
-    assert run("recordings", "rm", folder, "--robot", "fred", "--yes") == 0
-    assert run.out == "100 messages deleted\n"
-    assert messages(folder) == 101
-    assert run("recordings", "info", folder) == 0
-    assert "fred" not in run.out
 
 
 def test_what_a_recorder_uses_is_left_alone(folder: Path, run: Run) -> None:
@@ -120,19 +92,18 @@ def test_what_a_recorder_uses_is_left_alone(folder: Path, run: Run) -> None:
     assert messages(folder) == 201
 
 
-@pytest.mark.parametrize("number", [errno.ENOLCK, errno.EOPNOTSUPP])
 def test_a_share_without_locks_is_recorded_to(
-    folder: Path, run: Run, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, number: int
+    folder: Path, run: Run, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     left = folder / "2026/11/20/20261120T232921Z-000999.state.mcap.active"
     left.parent.mkdir(parents=True, exist_ok=True)
     left.write_bytes(b"")
-    monkeypatch.setattr("fcntl.flock", refused(number))
+    monkeypatch.setattr("fcntl.flock", refused(errno.ENOLCK))
     recorder = Recorder(folder, Options(free_bytes=0))
     recorder.start()
     recorder.receive(f"{GOOB}/outgoing/online", b'{"t":1}', 1, retain=False)
     recorder.stop()
-    assert f"recorder.lock cannot be locked ({os.strerror(number)})" in caplog.text
+    assert f"recorder.lock cannot be locked ({os.strerror(errno.ENOLCK)})" in caplog.text
     assert (messages(folder), left.exists()) == (202, True)  # what may be another recorder's stays
     assert run("recordings", "rm", left, "--yes") == 1
     assert run("recordings", "rm", folder, "--robot", "fred", "--yes") == 1
@@ -140,7 +111,7 @@ def test_a_share_without_locks_is_recorded_to(
 
 
 READING = [
-    ("search", "{rec}"), *(("export", "{rec}", f"{{tmp}}/a.{end}") for end in ("jsonl", "mcap", "mkv", "wav")),
+    ("search", "{rec}"), *(("export", "{rec}", f"{{tmp}}/a.{end}") for end in ("jsonl", "mkv")),
 ]  # fmt: skip
 NO_ROBOT = f"no robot pebble/robots/nosuch in {{rec}}; there are: {FRED}, {GOOB}\n"
 

@@ -24,11 +24,8 @@ def json_picture(keyframe: bool = True) -> bytes:
     "payload",
     [
         b'{"t": 1732300000123, "online": true}',
-        b'{"t":1732300000.123,"mcu":5}',
-        b'{"value":{"t":5},"t":1732300000123}',
         b'{"t":1732300000123,"value":{"t":5,"timestamp":7}}',
         b'{"timestamp":1732300000.123}',
-        b'{"timestamp":1732300000123}',
         b'{"t":1.732300000123e+12}',
         SOUND.pack(),
         PICTURE.pack(),
@@ -42,22 +39,16 @@ def test_the_own_stamp_is_found(payload):
 @pytest.mark.parametrize(
     "payload",
     [
-        b"",
-        b"{",
         b"P",
-        b"12",
         b'{"x":0.5}',
         b'{"t":-1732300000123}',
         b'{"t":1e300}',
-        b'{"t":99999999999999999999}',
         b'{"t":10000000000}',
         b'{"t":"1732300000123"}',
-        b'{"t":null}',
         b'{"value":{"t":1732300000123}}',
         SOUND.pack()[:23],
         PICTURE.pack()[:18],
         b"PBAT" + b"\xff" * 40,
-        b"PBVD" + bytes(40),
         b"\xff\xd8\xff",
     ],
 )
@@ -74,7 +65,6 @@ def test_a_stamp_of_a_board_counts_from_its_start():
     [
         (b'{"online":true,"t":1732300000123}', b'{"online":true,"t":1732300002623}'),
         (b'{"timestamp": 1732300000.1234567 }', b'{"timestamp":1732300002.6234567}'),
-        (b'{"t":1732300000123.25}', b'{"t":1732300002623.25}'),
         (b'{"t":1732300000123,"value":{"t":1732300000123}}', b'{"t":1732300002623,"value":{"t":1732300000123}}'),
         (
             b'{"t":1732300000123,"x":1,"timestamp":1732300000.5}',
@@ -83,7 +73,6 @@ def test_a_stamp_of_a_board_counts_from_its_start():
         (b'{"t":1732300000123', b'{"t":1732300000123'),
         (b'{"t":1234}', b'{"t":1234}'),
         (b'{"x":0.25}', b'{"x":0.25}'),
-        (b"", b""),
         (b"PBAT", b"PBAT"),
     ],
 )
@@ -130,14 +119,11 @@ def test_media_are_known_by_their_first_bytes():
     [
         (PICTURE.pack(), True),
         (Picture(PictureKind.DELTA_JPEG, 4, T_MS, b"").pack(), False),
-        (Picture(PictureKind.ZLIB_JPEG, 4, T_MS, b"").pack(), True),
-        (Picture(PictureKind.ZLIB_DELTA_JPEG, 4, T_MS, b"").pack(), False),
         (Picture(PictureKind.H264, 4, T_MS, b"", KEY_FRAME).pack(), True),
         (Picture(PictureKind.H264, 4, T_MS, b"").pack(), False),
         (json_picture(), True),
         (json_picture(False), False),
         (b"\xff\xd8\xff", True),
-        (b"PBVD", False),
         (SOUND.pack(), False),
         (b'{"keyframe":true}', False),
     ],

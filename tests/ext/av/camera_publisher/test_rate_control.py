@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -9,11 +10,11 @@ from math import ceil
 
 import pytest
 
+from pebble.services.camera_publisher.frame_selector import FrameSelector
 from pebble.services.camera_publisher.rate_control import STEPS, LevelControl, RateController
 from pebble.services.camera_publisher.send_window import Acknowledged, SendWindow
 from pebble.transports.base import Outgoing
 from pebble.transports.counters import Counters
-from tests.support import cases, some
 
 KILOBIT = 125.0  # bytes
 
@@ -82,8 +83,7 @@ class Run:
         return next((level for at, level in reversed(self.levels) if at <= when), 0)
 
 
-@pytest.mark.parametrize("delay_s", [0.001, 0.05, 0.2])
-@pytest.mark.parametrize("kbits", some([64, 128, 256, 512, 1000, 2000], 2))
+@pytest.mark.parametrize(("kbits", "delay_s"), [(64, 0.2), (256, 0.05), (2000, 0.001)])
 def test_pictures_stay_young_on_any_link(kbits: int, delay_s: float) -> None:
     run = Run(lambda _now: kbits, delay_s=delay_s).run(60)
     assert run.worst_age(0) < 3.5  # the very first, at full size
@@ -91,7 +91,7 @@ def test_pictures_stay_young_on_any_link(kbits: int, delay_s: float) -> None:
     assert run.rate(10, 60) > 2
 
 
-@pytest.mark.parametrize(("kbits", "delay_s"), [(9.6, 0.3), (19.2, 0.15), (64, 0.05)])
+@pytest.mark.parametrize(("kbits", "delay_s"), [(9.6, 0.3), (64, 0.05)])
 def test_on_a_thin_link_a_slow_picture_is_followed_by_a_rest(kbits: float, delay_s: float) -> None:
     """What is sent during the rest of the time finds the modem empty."""
     run = Run(lambda _now: kbits, full=40_000, delay_s=delay_s, thin=True).run(120)
@@ -100,9 +100,8 @@ def test_on_a_thin_link_a_slow_picture_is_followed_by_a_rest(kbits: float, delay
     assert run.worst_age(0) < 20_000 / (kbits * KILOBIT)  # the first one is small, too
 
 
-@pytest.mark.parametrize("kbits", [256, 512])
-def test_the_rate_is_the_last_to_go(kbits: int) -> None:
-    run = Run(lambda _now: kbits).run(60)
+def test_the_rate_is_the_last_to_go() -> None:
+    run = Run(lambda _now: 256).run(60)
     assert run.rate(10, 60) == pytest.approx(10, rel=0.04)
     assert 0 < run.level_at(30) < 7
 
@@ -115,17 +114,15 @@ def test_a_good_link_gets_everything_and_a_long_way_is_not_a_slow_link(kbits: in
     assert run.rate(15, 60) == pytest.approx(10, rel=0.02)
 
 
-@pytest.mark.parametrize("beacon_s", some([0.0666, 0.05, 0.1024, 0.09], 2))
-@pytest.mark.parametrize("fps", [10.0, 15.0, 30.0])
+@pytest.mark.parametrize(("fps", "beacon_s"), [(10.0, 0.0666), (30.0, 0.1024)])
 def test_confirmations_that_are_held_back_are_not_a_slow_link(fps: float, beacon_s: float) -> None:
     run = Run(lambda _: 20_000, full=4_000, fps=fps, delay_s=0.002, beacon_s=beacon_s).run(30)
     assert run.rate(2, 30) > 0.95 * fps
     assert run.level_at(20) == 0  # the first second may be misunderstood
 
 
-@pytest.mark.parametrize("kbits", [64, 256])
-def test_a_slow_link_is_noticed_behind_confirmations_that_are_held_back(kbits: int) -> None:
-    run = Run(lambda _: kbits, delay_s=0.002, beacon_s=0.1024).run(40)
+def test_a_slow_link_is_noticed_behind_confirmations_that_are_held_back() -> None:
+    run = Run(lambda _: 64, delay_s=0.002, beacon_s=0.1024).run(40)
     assert run.worst_age(5) < 0.8
 
 
@@ -137,15 +134,13 @@ def test_a_link_that_breaks_down_is_answered_at_once_and_gets_everything_back_wh
     assert run.level_at(59) >= 3
     assert run.level_at(199) == 0
     assert run.rate(180, 200) == pytest.approx(10, rel=0.02)
-    words = [str(step) for step in STEPS]
-    assert words[:4] == ["", "quality 3/4", "quality 1/2", "quality 1/2, size 3/4"]
-    assert words[-1] == "quality 1/2, size 1/4, rate 1/8"
+    assert str(STEPS[-1]) == "quality 1/2, size 1/4, rate 1/8"
     assert all(before.cost > after.cost for before, after in pairwise(STEPS))
 
 
 def test_a_steady_link_is_not_probed_all_the_time() -> None:
-    run = Run(lambda _now: 300).run(cases(160, 300))
-    assert len([at for at, _ in run.levels if at > 60]) <= cases(7, 16)
+    run = Run(lambda _now: 300).run(160)
+    assert len([at for at, _ in run.levels if at > 60]) <= 7
 
 
 def test_frames_sent_before_a_change_do_not_count() -> None:
@@ -175,9 +170,7 @@ class TestSendWindow:
         queue.clear()
         assert queue.age_s(0.0, 100.0) == 0.0, "a lost connection takes everything along"
 
-    @pytest.mark.parametrize(
-        ("real_s", "counted_s"), [(0.0, 0.0), (0.05, 0.0), (0.075, 0.0375), (0.1, 0.1), (3.0, 3.0)]
-    )
+    @pytest.mark.parametrize(("real_s", "counted_s"), [(0.05, 0.0), (0.075, 0.0375), (0.1, 0.1), (3.0, 3.0)])
     def test_short_times_may_be_a_late_acknowledgement(self, real_s: float, counted_s: float) -> None:
         queue = SendWindow()
         queue.sent(1000, 1.0)
@@ -189,3 +182,64 @@ class TestSendWindow:
             queue.sent(10_000, number)
             assert len(queue.poll(0, 0.0, number)) == 1
         assert queue.age_s(0.0, 1e6) == 0.0
+
+
+# -- which frames are sent
+
+
+SECONDS = 120
+
+
+def captures(fps: float, jitter_s: float, *, lost: float = 0.0) -> list[float]:
+    """Times of a camera's frames: each off its beat by up to ``jitter_s``, a share of them ``lost``."""
+    dice = random.Random(1)
+    times = [1000 + number / fps + dice.uniform(-jitter_s, jitter_s) for number in range(round(SECONDS * fps))]
+    return sorted(time for time in times if dice.random() >= lost)
+
+
+def taken(pacer: FrameSelector, times: list[float]) -> list[float]:
+    chosen = []
+    for time in times:
+        if pacer.due(time):
+            pacer.use(time)
+            chosen.append(time)
+    return chosen
+
+
+@pytest.mark.parametrize("jitter_s", [0.0, 0.010, 0.030])
+@pytest.mark.parametrize(("camera", "wanted"), [(10, 10), (10.05, 10), (15, 10), (29.97, 15), (30, 7)])
+def test_the_wanted_rate_is_what_comes_out(camera: float, wanted: float, jitter_s: float) -> None:
+    chosen = taken(FrameSelector(wanted), captures(camera, jitter_s))
+    assert len(chosen) / SECONDS == pytest.approx(min(camera, wanted), rel=0.01)
+
+
+def test_a_slower_camera_is_sent_whole_and_a_lost_frame_is_made_up_for() -> None:
+    times = captures(9.5, 0.020)
+    assert len(taken(FrameSelector(10), times)) >= 0.995 * len(times)
+    chosen = taken(FrameSelector(10), captures(30, 0.003, lost=0.2))
+    assert len(chosen) / SECONDS == pytest.approx(10, rel=0.01)
+
+
+def test_a_pause_is_not_made_up_for() -> None:
+    times = [*captures(30, 0.0)[:300], *(time + 60 for time in captures(30, 0.0)[300:600])]
+    assert len(taken(FrameSelector(10), times)) <= 202
+
+
+def test_a_turn_is_used_up_by_what_is_sent_and_another_rate_counts_from_now_on() -> None:
+    pacer = FrameSelector(10)
+    pacer.use(0.0)
+    assert [pacer.due(at) for at in (0.03, 0.1, 0.133)] == [False, True, True]
+    pacer = FrameSelector(1)
+    pacer.use(0.0)
+    assert not pacer.due(0.4)
+    pacer.fps = 10
+    assert pacer.fps == pytest.approx(10)
+    assert [pacer.due(at) for at in (0.45, 0.5)] == [False, True]
+
+
+def test_a_clock_that_went_back_begins_anew() -> None:
+    pacer = FrameSelector(10)
+    chosen = taken(pacer, captures(30, 0.0)[:30])
+    assert len(chosen) == 10
+    assert all(after - before == pytest.approx(0.1, abs=1e-6) for before, after in pairwise(chosen)), "evenly"
+    assert pacer.due(5.0)

@@ -24,13 +24,11 @@ def _scene() -> np.ndarray:
 
 
 def _yuyv(scene: np.ndarray) -> np.ndarray:
-    yuv = cv2.cvtColor(scene, cv2.COLOR_BGR2YUV)
     packed = np.empty((HEIGHT, WIDTH, 2), np.uint8)
     i420 = cv2.cvtColor(scene, cv2.COLOR_BGR2YUV_I420)
     packed[..., 0] = i420[:HEIGHT]
     chroma = i420[HEIGHT:].reshape(2, HEIGHT // 2, WIDTH // 2).repeat(2, axis=1)
     packed[:, ::2, 1], packed[:, 1::2, 1] = chroma
-    assert yuv.shape == scene.shape
     return packed
 
 
@@ -58,7 +56,7 @@ def test_every_format_shows_the_same(form: str, writable: bool) -> None:
 
 
 @pytest.mark.parametrize("form", PICTURE_FORMATS)
-@pytest.mark.parametrize("width", [8, 16, 20, 32, 64, 100])
+@pytest.mark.parametrize("width", [8, 20, 100])
 def test_a_reader_may_want_another_width(form: str, width: int) -> None:
     found = picture(MAKERS[form](_scene()).reshape(-1), FrameInfo(format=form, width=WIDTH, height=HEIGHT), width)
     assert found.shape == (width * HEIGHT // WIDTH, width, 3)
@@ -77,7 +75,6 @@ def test_rows_may_be_longer_than_their_pixels() -> None:
     [
         FrameInfo(format="s16le", rate=16000, channels=1),
         FrameInfo(),
-        FrameInfo(format="bgr24"),
         FrameInfo(format="bgr24", width=-1, height=-1),
         FrameInfo(format="bgr24", width=1 << 40, height=1 << 40),
         FrameInfo(format="bgr24", width=64, height=48, stride=1),

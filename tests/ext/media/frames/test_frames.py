@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -23,16 +24,90 @@ from pebble.extensions.media.frames.frame import encode
 from pebble.extensions.media.frames.session import METADATA, StreamNames, open_writing
 from pebble.transports import segments
 from pebble.transports.peers import prepare_run_dir
-from tests.ext.media.frames.frames_net import FramesNet
+from pebble.transports.segments import SHM
+from tests.ext.media.frames.frames_peer import Options
 from tests.locking import needs_shared_memory
-from tests.support import THOROUGH, needs_root, some, until
+from tests.support import needs_root, until
+from tests.transports.forked import Forked
 
 SMALL = 160 * 120 * 3  # to be shared all the same
-VGA = 640 * 480 * 3 if THOROUGH else SMALL
 QVGA = 320 * 240 * 3  # a pool of these fits into the 8 MiB that users may usually lock
 UNPRIVILEGED_USER = (
     65534 if os.geteuid() == 0 else os.geteuid()
 )  # root may lock what it likes; for others the limits count
+
+
+class Peer:
+    """One process; `ask` for its numbers."""
+
+    def __init__(self, role: str, folder: Path, options: Options) -> None:
+        arguments = (role, str(folder), msgspec.json.encode(options).decode())
+        self._process = Forked("tests.ext.media.frames.frames_peer", *arguments)
+        assert self._line() == "up"
+
+    def ask(self) -> dict[str, Any]:
+        self._process.stdin.write("?\n")
+        self._process.stdin.flush()
+        answer: dict[str, Any] = json.loads(self._line())
+        return answer
+
+    def reaches(self, condition: Callable[[dict[str, Any]], object], timeout: float = 10.0) -> dict[str, Any]:
+        """Ask until ``condition`` is true for an answer, and return that."""
+        answers: list[dict[str, Any]] = [{}]
+
+        def asked() -> object:
+            answers.append(self.ask())
+            return condition(answers[-1])
+
+        assert until(asked, timeout, step=0.02), answers[-1]
+        return answers[-1]
+
+    def has(self, **least: int) -> dict[str, Any]:
+        """Ask until every number is at least as given."""
+        return self.reaches(lambda answer: all(answer.get(name, 0) >= number for name, number in least.items()))
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.wait(10)
+        for pipe in (self._process.stdin, self._process.stdout):
+            with suppress(BrokenPipeError):
+                pipe.close()
+
+    def _line(self) -> str:
+        return self._process.stdout.readline().strip()
+
+    @property
+    def running(self) -> bool:
+        return self._process.poll() is None
+
+
+class FramesNet:
+    """A run directory and its peers; `close` ends them all."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        folder.mkdir(mode=0o700, exist_ok=True)
+        self._peers: list[Peer] = []
+
+    def writer(self, **options: Any) -> Peer:
+        return self._start("writer", Options(**options))
+
+    def reader(self, **options: Any) -> Peer:
+        return self._start("reader", Options(**options))
+
+    def _start(self, role: str, options: Options) -> Peer:
+        peer = Peer(role, self.folder, options)
+        self._peers.append(peer)
+        return peer
+
+    def close(self) -> None:
+        for peer in self._peers:
+            if peer.running:
+                peer.kill()
 
 
 @pytest.fixture
@@ -42,63 +117,53 @@ def net(tmp_path: Path) -> Iterator[FramesNet]:
     net.close()
 
 
-SHOWN = 60  # frames, of which readers that a busy machine holds up need not see all
+def test_a_slow_reader_gets_the_newest(tmp_path: Path) -> None:
+    with FrameWriter(tmp_path, "camera", capacity=60_000) as writer, FrameReader(tmp_path, "camera") as reader:
+        assert until(lambda: writer.wanted)
+        for number in range(10):
+            assert writer.write(bytes([number]) * 640, FrameInfo())
+        assert until(lambda: reader.counters["received"] == 10)
+        frame = reader.read(5)
+        assert frame is not None
+        assert (frame.data[0], reader.counters["skipped"]) == (9, 9)
 
 
-@pytest.mark.parametrize(("born", "views"), some([(True, True), (False, True), (True, False), (False, False)], 3))
-def test_every_reader_gets_whole_frames_through_shared_memory(net: FramesNet, born: bool, views: bool) -> None:
-    """Each of them: a frame is sent as bytes only when all slots are in use, and here each frame has one of its own.
-
-    Of six slots three readers that stand still hold all: one that each looks at, and one that waits for it.
-    """
-    readers = [net.reader(views=views, depth=SHOWN) for _ in range(3)]
-    writer = net.writer(size=SMALL, rate=60, born=born, limit=SHOWN, slots=SHOWN + 2)
-    for reader in readers:
-        seen = reader.has(shared=20)
-        assert (seen["wrong"], seen["backwards"], seen.get("copied", 0)) == (0, 0, 0)
-    printed = writer.has(written=SHOWN)
-    assert (printed["readers"], printed["shared"], printed.get("fallbacks", 0)) == (3, SHOWN, 0)
-    assert writer.close() == 0
-    assert [reader.close() for reader in readers] == [0, 0, 0]
+def test_a_deep_reader_gets_them_all_in_order_and_small_frames_travel_as_bytes(tmp_path: Path) -> None:
+    with FrameWriter(tmp_path, "camera", capacity=640) as writer, FrameReader(tmp_path, "camera", depth=100) as reader:
+        assert until(lambda: writer.wanted)
+        for number in range(100):
+            assert writer.write(bytes([number]) * 640, FrameInfo())
+        frames = [reader.read(5) for _ in range(100)]
+        assert [frame is not None and (frame.data[0], frame.shared) for frame in frames] == [
+            (number, False) for number in range(100)
+        ]
+        assert (reader.problem, writer.shared, writer.problem, writer.counters["fallbacks"]) == ("", False, "", 0)
 
 
-def test_a_slow_reader_gets_the_newest(net: FramesNet) -> None:
-    writer = net.writer(rate=200)
-    reader = net.reader(work_s=0.1)
-    seen = reader.has(frames=5, skipped=20)
-    assert seen["backwards"] == 0
-    assert writer.ask()["written"] - seen["last"] < 100  # half a second, generously
-
-
-def test_a_deep_reader_gets_them_all_in_order_and_small_frames_travel_as_bytes(net: FramesNet) -> None:
-    reader = net.reader(depth=100)
-    writer = net.writer(rate=200, limit=100, size=640)
-    seen = reader.has(frames=100, copied=100)
-    assert (seen.get("skipped", 0), seen.get("missed", 0), seen["backwards"], seen["problem"]) == (0, 0, 0, "")
-    printed = writer.ask()
-    assert (printed["sharing"], printed["problem"], printed.get("fallbacks", 0)) == (False, "", 0)
-
-
-def test_a_writer_sends_nothing_without_readers(net: FramesNet) -> None:
-    writer = net.writer()
+def test_readers_and_writers_that_are_killed_are_noticed_and_their_segments_swept(net: FramesNet) -> None:
+    writer = net.writer(size=SMALL)
     resting = writer.has(unwanted=10)
     assert (resting["wanted"], resting.get("written", 0)) == (False, 0)
-    reader = net.reader()
-    assert reader.has(frames=10)["last"] >= 10
-    reader.kill()
-    writer.reaches(lambda printed: not printed["wanted"])
-
-
-@pytest.mark.parametrize("how", ["kill", "close"])
-def test_living_readers_find_a_restarted_writer_within_a_second(net: FramesNet, how: str) -> None:
     readers = [net.reader(), net.reader(views=True)]
-    for life in (1, 2):
-        writer = net.writer(size=VGA)
+
+    def all_receive(life: int) -> None:
         for reader in readers:
             before = reader.ask().get("frames", 0)
             reader.reaches(lambda seen, before=before: seen["frames"] > before, 3)
-            assert reader.ask()["writers"] == life
-        getattr(writer, how)()
+            assert (reader.ask()["writers"], reader.ask()["wrong"]) == (life, 0)
+
+    all_receive(1)
+    writer.kill()
+    writer = net.writer(size=SMALL)
+    all_receive(2)
+    maps = [line for peer in (writer, *readers) for line in Path(f"/proc/{peer.pid}/maps").read_text().splitlines()]
+    used = {SHM / Path(line.split()[5]).name for line in maps if ".zenoh" in line}
+    assert len(used) >= 2
+    for reader in readers:
+        reader.kill()
+    writer.reaches(lambda printed: not printed["wanted"])
+    writer.kill()
+    assert until(lambda: segments.sweep() >= 0 and not any(path.exists() for path in used), 5)
 
 
 def test_there_is_one_writer_at_a_time(tmp_path: Path) -> None:
@@ -109,24 +174,6 @@ def test_there_is_one_writer_at_a_time(tmp_path: Path) -> None:
             pass
     with FrameWriter(tmp_path, "camera", capacity=1000):
         pass
-
-
-@pytest.mark.alone
-def test_a_stopped_reader_does_not_starve_the_others(net: FramesNet) -> None:
-    writer = net.writer(size=VGA, rate=60)
-    stopped, other = net.reader(views=True), net.reader(views=True)
-    stopped.has(frames=5)
-    other.has(frames=5)
-    stopped.signal(signal.SIGSTOP)
-    printed = writer.has(fallbacks=1, reclaimed=1)
-    before = other.ask()
-    seen = other.has(frames=before["frames"] + 100)
-    assert seen.get("missed", 0) + seen.get("torn", 0) + seen["invalid"] <= 0.2 * seen["last"]
-    assert seen["wrong"] == 0
-    stopped.signal(signal.SIGCONT)
-    back = stopped.ask()
-    assert stopped.has(frames=back["frames"] + 20)["wrong"] == 0
-    assert printed["readers"] >= 1
 
 
 @pytest.fixture
@@ -208,15 +255,7 @@ def test_a_writer_knows_when_its_memory_was_removed(tmp_path: Path) -> None:
 
 
 @needs_root
-@pytest.mark.parametrize(
-    ("at_first", "then"),
-    [
-        ("size=1m", "mount -o remount,size=64m /dev/shm"),
-        ("size=64m,ro", "mount -o remount,rw /dev/shm"),
-        ("size=64m", "rm /dev/shm/others"),
-    ],
-)
-def test_frames_are_shared_once_there_is_room(tmp_path: Path, at_first: str, then: str) -> None:
+def test_frames_are_shared_once_there_is_room(tmp_path: Path) -> None:
     """The writer is opened again for it, as av_daemon is; a reader that had no room either finds it by itself."""
     program = (
         "import subprocess, sys, time; from pathlib import Path; from pebble.extensions.media.frames import *\n"
@@ -230,9 +269,9 @@ def test_frames_are_shared_once_there_is_room(tmp_path: Path, at_first: str, the
         "        w.write(b'x' * 900_000, FrameInfo()); frame = r.read(0.2) or frame\n"
         "    print(before, w.problem, r.problem, frame and frame.shared, w.may_share); w.close()"
     )
-    mount = f"mount -t tmpfs -o {at_first} none /dev/shm && (dd if=/dev/zero of=/dev/shm/others bs=1M || true)"
+    mount = "mount -t tmpfs -o size=64m none /dev/shm && (dd if=/dev/zero of=/dev/shm/others bs=1M || true)"
     command = ["unshare", "-m", "sh", "-c", mount + ' 2>/dev/null; exec "$@"', "sh", sys.executable, "-c", program]
-    printed = subprocess.check_output([*command, str(tmp_path), then], timeout=40, text=True)
+    printed = subprocess.check_output([*command, str(tmp_path), "rm /dev/shm/others"], timeout=40, text=True)
     assert printed == "(False, False)   True False\n"
 
 
@@ -265,7 +304,7 @@ def test_past_a_limit_of_mapped_memory_frames_come_as_bytes_and_the_reader_repor
 ) -> None:
     monkeypatch.setattr(frame_reader, "MAPPED_LIMIT", -1)
     with FrameReader(net.folder, "camera") as reader:
-        net.writer(size=VGA, rate=60)
+        net.writer(size=SMALL, rate=60)
 
         def comes_as_bytes() -> bool:
             frame = reader.read(1)
@@ -291,8 +330,12 @@ def test_anything_with_bytes_can_be_written(tmp_path: Path) -> None:
     flat = picture.tobytes()
     whole = np.zeros((100, 400, 3), np.uint8)
     whole[:, ::2] = picture
-    with FrameWriter(tmp_path, "camera", capacity=60_000) as writer, FrameReader(tmp_path, "camera") as reader:
-        assert until(lambda: writer.wanted)
+    with (
+        FrameWriter(tmp_path, "camera", capacity=60_000) as writer,
+        FrameReader(tmp_path, "camera") as reader,
+        FrameReader(tmp_path, "camera", sharing=False) as of_bytes,
+    ):
+        assert until(lambda: writer.readers == 2)
         for data in (picture, whole[:, ::2], flat, bytearray(flat), memoryview(flat), np.frombuffer(flat, "<u2")):
             assert writer.write(data, FrameInfo(format="bgr24", width=200, height=100))
             frame = reader.read(5)
@@ -301,43 +344,15 @@ def test_anything_with_bytes_can_be_written(tmp_path: Path) -> None:
             assert frame.data.tobytes() == flat
             frame.data[0] = 7  # it is ours
             assert frame.picture().shape == (100, 200, 3)
+            copied = of_bytes.read(5)
+            assert copied is not None
+            assert (copied.data.tobytes(), copied.shared) == (flat, False)
+        assert (of_bytes.shared, of_bytes.problem) == (False, "")
         assert writer.write(b"x" * 1_000_000, FrameInfo())  # no slot is that large
         big = reader.read(5)
         assert big is not None
         assert (big.data.size, big.shared) == (1_000_000, False)
         assert writer.counters["fallbacks"] == 1
-
-
-@needs_shared_memory
-def test_a_reader_may_choose_bytes_and_then_maps_nothing(tmp_path: Path) -> None:
-    program = (
-        "import sys; from pathlib import Path; from pebble.extensions.media.frames import memory\n"
-        "from pebble.extensions.media.frames import *\n"
-        "with FrameReader(Path(sys.argv[1]), 'camera', sharing=False) as reader:\n"
-        "    frame = reader.read(10)\n"
-        "    print(frame.data.tobytes() == bytes([7]) * 60_000, frame.shared, reader.shared, repr(reader.problem))\n"
-        "    print(memory.mapped())\n"
-    )
-    with FrameWriter(tmp_path, "camera", capacity=60_000) as writer, FrameReader(tmp_path, "camera") as other:
-        with subprocess.Popen(
-            [sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE, text=True
-        ) as reader:
-            assert until(lambda: writer.readers == 2, 10)
-            assert writer.write(b"\7" * 60_000, FrameInfo())
-            assert reader.communicate(timeout=20)[0] == "True False False ''\n0\n"
-        frame = other.read(5)
-        assert frame is not None
-        assert frame.shared
-
-
-def test_segments_of_killed_processes_are_swept(net: FramesNet) -> None:
-    reader, writer = net.reader(views=True), net.writer(size=VGA)
-    reader.has(frames=5)
-    net.note_segments()
-    assert len(net.left()) >= 2
-    writer.kill()
-    reader.kill()
-    assert until(lambda: segments.sweep() >= 0 and not net.left(), 5)
 
 
 def test_the_name_of_a_stream_is_part_of_a_path(tmp_path: Path) -> None:

@@ -83,17 +83,14 @@ def publish_all(robot: Transport, reference: Reference, number: int = 300) -> No
     assert until(lambda: len(reference.of(DRIVE)) == number, 10)
 
 
-@pytest.mark.parametrize("filters", [(), ("--filter", "#", "--filter", "pebble/#")])
-def test_what_a_subscriber_sees_is_recorded_byte_for_byte_with_its_flags(
-    tmp_path: Path, filters: tuple[str, ...]
-) -> None:
+def test_what_a_subscriber_sees_is_recorded_byte_for_byte_with_its_flags(tmp_path: Path) -> None:
     broker = Broker(tmp_path)
     robot = client(broker.port)
     for count in range(1500):
         robot.publish(f"{GOOB}/outgoing/many/{count}", b"%d" % count, retain=True)
     robot.publish(FLAG, b"true", qos=QoS.DELIVERED, retain=True)
     reference = Reference(broker.port)
-    with recording(tmp_path / "rec", broker.port, *filters):
+    with recording(tmp_path / "rec", broker.port, "--filter", "#", "--filter", "pebble/#"):
         publish_all(robot, reference)
         robot.publish(STATUS, b"{}", qos=QoS.DELIVERED, retain=True)
         robot.publish("replay/robots/goob/outgoing/online", b"{}", retain=True)
@@ -135,20 +132,14 @@ def test_a_broker_that_knows_only_mqtt_3(tmp_path: Path) -> None:
         broker.stop()
 
 
-@pytest.mark.parametrize("how", ["killed", "stopped"])
-def test_an_outage_is_a_gap(tmp_path: Path, how: str) -> None:
+def test_an_outage_is_a_gap(tmp_path: Path) -> None:
     broker, root = Broker(tmp_path), tmp_path / "rec"
     with recording(root, broker.port):
         time.sleep(1.0)
         began = time.time()
-        if how == "killed":
-            broker.kill()
-            time.sleep(1.0)
-            broker.start()
-        else:
-            os.kill(broker.pid, signal.SIGSTOP)
-            time.sleep(3.0)
-            os.kill(broker.pid, signal.SIGCONT)
+        os.kill(broker.pid, signal.SIGSTOP)
+        time.sleep(3.0)
+        os.kill(broker.pid, signal.SIGCONT)
         ended = time.time()
         assert until(lambda: events(recorded(root), "gap"), 10, step=0.2)
     (gap,) = events(recorded(root), "gap")
@@ -158,31 +149,26 @@ def test_an_outage_is_a_gap(tmp_path: Path, how: str) -> None:
     broker.stop()
 
 
-class TestErrors:
-    def test_there_is_no_broker_yet(self, tmp_path: Path) -> None:
-        with program("record", "--url", "mqtt://127.0.0.1:1", "--into", tmp_path / "rec", "--for", "1s") as process:
-            assert process.stderr is not None
-            assert "cannot connect to mqtt://127.0.0.1:1 yet" in process.stderr.readline()
-            assert process.wait(20) == 0
+def test_there_is_no_broker_yet(tmp_path: Path) -> None:
+    with program("record", "--url", "mqtt://127.0.0.1:1", "--into", tmp_path / "rec", "--for", "1s") as process:
+        assert process.stderr is not None
+        assert "cannot connect to mqtt://127.0.0.1:1 yet" in process.stderr.readline()
+        assert process.wait(20) == 0
 
-    @pytest.mark.parametrize(
-        ("arguments", "problem"),
-        [
-            (("--url", "http://x"), "--url must be mqtt://"),
-            ((), "where to connect is missing"),
-            (("--url", "mqtt://127.0.0.1", "--rotate", "soon"), '"soon" is not a duration: 30s, 10min, 1h or 7d'),
-            (("--url", "mqtt://127.0.0.1", "--keep", "much"), '"much" is not a size: 64M, 2G or 1T'),
-            (("--url", "mqtt://127.0.0.1", "-f", "a/#/b"), "a/#/b"),
-            (
-                ("--url", "mqtt://127.0.0.1", "--into", "/proc/x"),
-                "/proc/x: No such file or directory: name another folder",
-            ),
-        ],
-    )
-    def test_one_line(
-        self, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], problem: str
-    ) -> None:
-        monkeypatch.chdir(tmp_path)
-        assert run("record", *arguments) != 0
-        assert problem in run.err
-        assert len(run.err.strip().splitlines()) == 1
+
+@pytest.mark.parametrize(
+    ("arguments", "problem"),
+    [
+        ((), "where to connect is missing"),
+        (("--url", "mqtt://127.0.0.1", "--rotate", "soon"), '"soon" is not a duration: 30s, 10min, 1h or 7d'),
+        (("--url", "mqtt://127.0.0.1", "--keep", "much"), '"much" is not a size: 64M, 2G or 1T'),
+        (("--url", "mqtt://127.0.0.1", "--into", "/proc/x"), "/proc/x: No such file or directory: name another folder"),
+    ],
+)
+def test_mistakes_are_one_line(
+    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], problem: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run("record", *arguments) != 0
+    assert problem in run.err
+    assert len(run.err.strip().splitlines()) == 1

@@ -6,7 +6,6 @@ import errno
 import json
 import os
 import random
-import shutil
 import subprocess
 import sys
 import threading
@@ -31,7 +30,7 @@ from pebble.extensions.recordings.recorder.lane import Item, OpenFile, RawFile
 from pebble.extensions.recordings.recorder.recorder import Recorder
 from pebble.extensions.recordings.recorder.settings import Options
 from tests.small_disk import SmallDisk
-from tests.support import beside, cases, needs_root, until
+from tests.support import ROOT, beside, cases, needs_root, until
 
 BASE = "pebble/robots/goob"
 ONLINE, CAMERA = f"{BASE}/outgoing/online", f"{BASE}/outgoing/front-camera"
@@ -105,6 +104,7 @@ class TestFiles:
         running.send(500)
         running.recorder.receive(f"{BASE}/incoming/flags/mqtt-video", b"true", 1, retain=True, retained=True)
         running.recorder.receive("a/b", b"\x00\x01", None, retain=None)
+        running.recorder.receive(EVENTS, b'{"event":"gap"}', 1, False)  # forged
         running.stop()
         found = recorded(running.root)
         assert payloads(running.root) == [b"%d" % number for number in range(500)]
@@ -113,6 +113,7 @@ class TestFiles:
         assert flags[f"{BASE}/incoming/flags/mqtt-video"] == ("json", {"qos": "1", "retain": "1", "retained": "1"})
         assert flags["a/b"] == ("application/octet-stream", {})
         assert [event["event"] for event in map(json.loads, payloads(running.root, EVENTS))] == ["start", "stop"]
+        assert running.recorder.counters["refused"] == 1
 
     def test_each_robots_media_have_files_of_their_own(self, running: Running) -> None:
         running.send()
@@ -143,21 +144,22 @@ class TestFiles:
         """However long the disk holds up the writer, and whatever happens to the recording meanwhile."""
         monkeypatch.setattr(RawFile, "write", _slowly(RawFile.write, 0.4))
         running = Running(tmp_path / "rec")
-        for _ in range(60):
+        for _ in range(25):
             running.send(payload=b'{"t":%d}' % (time.time_ns() // 10**6))
             running.recorder.note("connected")
             time.sleep(0.02)
         running.stop()
         online = [message for message in recorded(running.root) if message.channel.topic == ONLINE]
-        assert len(online) == 60
+        assert len(online) == 25
         assert max(abs(message.log_ns - message.publish_ns) for message in online) < 100e6
 
-    @pytest.mark.parametrize("retain", [False, None])
-    def test_carried_values_are_those_of_each_broker_and_the_newest(self, tmp_path: Path, retain: bool | None) -> None:
+    def test_files_are_rotated_and_carry_the_newest_value_of_each_broker(self, tmp_path: Path) -> None:
         running = Running(tmp_path / "rec", Options(free_bytes=0, rotate_seconds=0.5))
-        flag, receive = f"{BASE}/incoming/flags/mqtt-video", running.recorder.receive
+        flag, gone, receive = f"{BASE}/incoming/flags/mqtt-video", f"{BASE}/outgoing/gone", running.recorder.receive
         receive(flag, b"true", None, True, retained=True)
-        receive(flag, b"false", 1, retain)
+        receive(flag, b"false", 1, None)
+        receive(gone, b"1", 1, True)
+        receive(gone, b"", 1, True)
         receive(ONLINE, b"one", 1, True, source="one")
         receive(ONLINE, b"two", 1, True, source="two")
         receive(STATUS, b"gone", None, True, retained=True, source="two")
@@ -165,10 +167,14 @@ class TestFiles:
         receive(ONLINE, b"three", None, True, retained=True, source="two")
         receive(STATUS, b"newer", 1, True, source="one")
         receive(STATUS, b"older", None, True, retained=True, source="one")  # fetched meanwhile by another connection
-        time.sleep(1.5)
+        for _ in range(30):
+            running.send(topic=f"{BASE}/outgoing/live")
+            time.sleep(0.05)
         running.stop()
+        assert len(library.files([running.root])) >= 2
         carried = {m.payload for m in recorded(running.root) if m.channel.metadata.get("retained") == "carried"}
-        assert carried == {b"false" if retain is None else b"true", b"one", b"three", b"newer"}
+        assert carried == {b"false", b"one", b"three", b"newer"}
+        assert payloads(running.root, f"{BASE}/outgoing/live") == [b"%d" % number for number in range(30)]
 
     def test_no_media(self, tmp_path: Path) -> None:
         running = Running(tmp_path / "rec", Options(free_bytes=0, media=False))
@@ -177,25 +183,7 @@ class TestFiles:
         running.stop()
         assert [path.name.split(".")[1] for path in library.files([tmp_path])] == ["state"]
 
-    def test_files_are_rotated_and_the_next_begins_with_the_retained_values(self, tmp_path: Path) -> None:
-        running = Running(tmp_path / "rec", Options(free_bytes=0, rotate_seconds=1.0))
-        running.send(topic=f"{BASE}/outgoing/status", payload=b'{"a": 1}', retain=True)
-        running.send(topic=f"{BASE}/outgoing/gone", payload=b"1", retain=True)
-        running.send(topic=f"{BASE}/outgoing/gone", payload=b"", retain=True)
-        for _ in range(30):
-            running.send()
-            time.sleep(0.05)
-        running.stop()
-        files = library.files([running.root])
-        assert len(files) >= 2
-        with RecordingFile(files[-1]) as file:
-            assert file.metadata()["pebble.recording"]["lane"] == "state"
-        again = [m for m in library.merged(files[1:2]) if m.channel.metadata.get("retained") == "carried"]
-        assert [message.payload for message in again] == [b'{"a": 1}']
-        live = [m.payload for m in recorded(running.root) if m.channel.topic == ONLINE]
-        assert live == [b"%d" % number for number in range(3, 33)]
-
-    @pytest.mark.parametrize(("limit", "most"), [("_MOST_CHANNELS", 1000), ("_MOST_INDEXED", 5)])
+    @pytest.mark.parametrize(("limit", "most"), [("_MOST_CHANNELS", 500), ("_MOST_INDEXED", 5)])
     def test_a_stranger_may_invent_topics(
         self, running: Running, monkeypatch: pytest.MonkeyPatch, limit: str, most: int
     ) -> None:
@@ -203,23 +191,17 @@ class TestFiles:
         monkeypatch.setattr(lane, limit, most)
         running.send()
         assert running.written(1)
-        for number in range(6000):
+        for number in range(2000):
             running.recorder.receive(f"pebble/robots/evil{number % 7}/outgoing/{number}", b"%d" % number, 0, False)
-        assert running.written(6001)
+        assert running.written(2001)
         running.send()
         running.stop()
         found = recorded(running.root)
         evil = {message.channel.topic: message.payload for message in found if "evil" in message.channel.topic}
-        assert len(evil) == 6000
+        assert len(evil) == 2000
         assert all(topic.endswith(payload.decode()) for topic, payload in evil.items())
         assert len(payloads(running.root)) == 2
         assert len(library.files([running.root])) >= 2
-
-    def test_events_cannot_be_forged(self, running: Running) -> None:
-        running.recorder.receive(EVENTS, b'{"event":"gap"}', 1, False)
-        running.stop()
-        assert events(running.root, "gap") == []
-        assert running.recorder.counters["refused"] == 1
 
     def test_the_folder_has_one_recorder(self, running: Running) -> None:
         with pytest.raises(RecordingError, match="a recorder writes here: stop it first"):
@@ -227,14 +209,6 @@ class TestFiles:
         assert Folder.is_in_use(running.root)
         running.stop()
         assert not Folder.is_in_use(running.root)
-
-
-@contextmanager
-def _removed(disk: SmallDisk) -> Iterator[None]:
-    (disk.root / "rec").rename(disk.root / "away")
-    yield
-    shutil.rmtree(disk.root / "rec")
-    (disk.root / "away").rename(disk.root / "rec")
 
 
 @contextmanager
@@ -248,7 +222,6 @@ def _unmounted(disk: SmallDisk) -> Iterator[None]:
 #: What happens to the disk, and what the log says.
 FAULTS: dict[str, tuple[Callable[[SmallDisk], AbstractContextManager[None]], str]] = {
     "unmounted": (_unmounted, "was removed, or is on another disk now"),
-    "removed": (_removed, "was removed, or is on another disk now"),
     "full": (SmallDisk.full, "the disk is full: nothing is recorded until that is mended"),
 }
 
@@ -257,63 +230,67 @@ class TestDisk:
     def test_a_slow_disk_blocks_no_sender_and_costs_pictures_first(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(RawFile, "write", _slowly(RawFile.write, 0.7))
-        monkeypatch.setattr(recorders, "QUEUE_BYTES", 600_000)
+        monkeypatch.setattr(RawFile, "write", _slowly(RawFile.write, 0.3))
+        monkeypatch.setattr(recorders, "QUEUE_BYTES", 300_000)
         running = Running(tmp_path / "rec")
         running.send()
         assert until(lambda: running.recorder.waiting == 0, 10)
         began = time.monotonic()
-        for _ in range(300):
+        for _ in range(150):
             running.send(topic=CAMERA, payload=PICTURE + bytes(5000))
             running.send()
         assert time.monotonic() - began < 1.0
         assert until(lambda: running.recorder.counters["event_dropped"], 10)
         written = running.recorder.counters["written"]
         running.send()
-        assert running.written(written + 300)  # the others of the queue, and then once more
+        assert running.written(written + 150)  # the others of the queue, and then once more
         dropped = running.recorder.counters["dropped"]
         running.stop()
-        assert dropped > 100
-        assert len(payloads(running.root)) == 302
+        assert dropped > 50
+        assert len(payloads(running.root)) == 152
         assert sum(event["messages"] for event in events(running.root, "dropped")) == dropped
 
-    def test_a_full_disk_loses_only_what_comes_meanwhile_and_the_count_is_written_down(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    @pytest.mark.parametrize("fault", ["write", "open"])
+    def test_a_fault_costs_only_what_comes_meanwhile_and_the_count_is_written_down(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: str
     ) -> None:
-        full, write = threading.Event(), RawFile.write
+        broken, write, create = threading.Event(), RawFile.write, Folder.create
 
         def raw_write(self: Any, data: memoryview) -> int | None:
-            if full.is_set():
+            if fault == "write" and broken.is_set():
                 if len(data) < 50:
                     raise OSError(errno.ENOSPC, "No space left on device")
                 return write(self, data[:40])  # a part of it still fits
             return write(self, data)
 
+        def created(self: Folder, lane: str, now_ns: int) -> Any:
+            if fault == "open" and broken.is_set():
+                raise OSError(errno.EIO, "Input/output error")
+            return create(self, lane, now_ns)
+
         monkeypatch.setattr(RawFile, "write", raw_write)
+        monkeypatch.setattr(Folder, "create", created)
         running = Running(tmp_path / "rec")
         running.send(100)
         assert running.written(100)
-        full.set()
+        broken.set()
         running.send(50)
+        running.send(topic=CAMERA, payload=PICTURE)
         assert until(lambda: bool(running.recorder.blocked), 10)
         running.send(70)
         running.recorder.note("lost", why="meanwhile")
         assert until(lambda: running.recorder.counters["dropped"] == 70, 10)
-        full.clear()
-        assert until(lambda: running.recorder.counters["event_recovered"] == 1, 10)
+        broken.clear()
+        failed_files = int(fault == "write")
+        assert until(lambda: running.recorder.counters["event_recovered"] == failed_files, 10)
+        assert until(lambda: not running.recorder.blocked, 10)
         running.send(10)
         running.stop()
-        expected = [b"%d" % number for number in (*range(150), *range(220, 230))]
+        expected = [b"%d" % number for number in (*range(150), *range(221, 231))]
         assert sorted(payloads(running.root), key=int) == expected
-        gap = events(running.root, "gap")
-        assert [event["messages"] for event in gap] == [70]
-        assert [len(events(running.root, name)) for name in ("recovered", "lost")] == [1, 1]
-        assert [
-            record.getMessage() for record in caplog.records if record.name.startswith("pebble.extensions.recordings")
-        ] == [
-            "the disk is full: nothing is recorded until that is mended",
-            "recording again",
-        ]
+        assert payloads(running.root, CAMERA) == [PICTURE]
+        assert [event["messages"] for event in events(running.root, "gap")] == [70]
+        assert [len(events(running.root, name)) for name in ("recovered", "lost")] == [failed_files, 1]
 
     def test_the_oldest_media_go_first_and_what_is_not_ours_stays(self, tmp_path: Path) -> None:
         root = tmp_path / "rec"
@@ -389,32 +366,6 @@ class TestDisk:
             disk.close()
         assert {*range(20), running.sent - 1} <= found
 
-    def test_a_file_that_cannot_be_opened_costs_what_comes_meanwhile_and_no_more(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        create, refused = Folder.create, threading.Event()
-
-        def fails(self: Folder, lane: str, now_ns: int) -> Any:
-            if lane != "state" and not refused.is_set():
-                refused.set()
-                raise OSError(errno.EIO, "Input/output error")
-            return create(self, lane, now_ns)
-
-        monkeypatch.setattr(Folder, "create", fails)
-        running = Running(tmp_path / "rec")
-        running.send(50)
-        running.send(topic=CAMERA, payload=PICTURE)
-        assert until(lambda: bool(running.recorder.blocked), 10)
-        running.send(30)
-        assert until(lambda: not running.recorder.blocked, 10)
-        running.send(50)
-        running.stop()
-        dropped = running.recorder.counters["dropped"]
-        assert len(payloads(running.root)) + len(payloads(running.root, CAMERA)) + dropped == 131
-        assert dropped <= 30
-        assert payloads(running.root, CAMERA) == [PICTURE]
-        assert [event["messages"] for event in events(running.root, "gap")] == [dropped]
-
     def test_what_a_full_disk_never_took_is_counted_at_the_end(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -432,8 +383,6 @@ class TestDisk:
     def test_no_room_from_the_start(self, tmp_path: Path) -> None:
         running = Running(tmp_path / "rec", Options(free_bytes=1 << 60))
         assert until(lambda: "the disk is full" in running.recorder.blocked, 10)
-        running.send(10)
-        assert until(lambda: running.recorder.counters["dropped"] == 10, 10)
         running.stop()
 
 
@@ -446,7 +395,7 @@ def _slowly(write: Any, seconds: float) -> Any:
 
 
 class TestClock:
-    @pytest.mark.parametrize("by_s", [-3600.0, 3600.0, 40 * 86_400.0])
+    @pytest.mark.parametrize("by_s", [-3600.0, 40 * 86_400.0])
     def test_a_jump_begins_a_new_file_and_time_never_goes_back_in_one(self, tmp_path: Path, by_s: float) -> None:
         shift = [0]
         running = Running(tmp_path / "rec", clocks=Clocks(wall_ns=lambda: time.time_ns() + shift[0]))
@@ -541,3 +490,25 @@ class TestEnds:
         assert running.written(20)
         (path,) = running.root.rglob("*.active")
         assert until(lambda: synced[-1:] == [path.stat().st_size], 10)
+
+
+# A last block that lives keeps all pages below it, which hold nothing, at the process.
+_MEMORY = """
+import os
+from tests.own_memory import own_mb
+from pebble.extensions.recordings.recorder.background import return_free_pages
+
+blocks = [bytes(2000) for _ in range(20_000)]
+last = blocks.pop()
+del blocks
+before = own_mb(os.getpid())
+return_free_pages()
+print(before - own_mb(os.getpid()))
+"""
+
+
+@pytest.mark.skipif("CS_GNU_LIBC_VERSION" not in os.confstr_names, reason="needs glibc")
+def test_free_pages_are_returned() -> None:
+    command = [sys.executable, "-c", _MEMORY]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=30)
+    assert float(done.stdout) > 30

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -32,19 +31,12 @@ def walk(tmp_path: Path) -> Path:
     return write(tmp_path / "walk.mcap", [Line(n, LOGS, js(n=n, t=ms(n))) for n in range(60)])
 
 
-@pytest.mark.parametrize("speed", [0.1, 1.0, 7.0, 100.0])
+@pytest.mark.parametrize("speed", [0.1, 7.0])
 def test_messages_come_in_order_and_at_their_pace(walk: Path, speed: float) -> None:
     stage = Stage(walk, ALL, speed=speed).run()
     assert numbers(stage) == list(range(60))
     assert [round(sent.at * speed, 3) for sent in stage.sent] == list(range(60))
     assert (stage.player.sent, stage.player.skipped, stage.player.ended) == (60, 0, True)
-
-
-def test_speed_has_limits(walk: Path) -> None:
-    stage = Stage(walk, ALL, speed=1000)
-    assert stage.player.speed == 100
-    stage.player.speed = 0.01
-    assert stage.player.speed == 0.1
 
 
 def test_speed_may_change_meanwhile(walk: Path) -> None:
@@ -53,12 +45,9 @@ def test_speed_may_change_meanwhile(walk: Path) -> None:
     assert stage.sent[10].at == pytest.approx(10)
     assert stage.sent[11].at == pytest.approx(10.55, abs=0.01)
     assert stage.sent[-1].at == pytest.approx(10.5 + 4.85, abs=0.01)
-
-
-def test_stamps_are_as_old_as_they_were(walk: Path) -> None:
-    stage = Stage(walk, Options(), speed=2.0).run()
-    for sent in stage.sent:
-        assert stamp_ns(sent.message.payload) == pytest.approx(NOW_NS + sent.at * 1e9, abs=2e6)
+    for asked, speed in ((1000, 100), (0.01, 0.1)):
+        stage.player.speed = asked
+        assert stage.player.speed == speed
 
 
 @pytest.mark.parametrize(("paused", "number", "begins"), [(False, 11, 100.5), (True, 0, 100)])
@@ -69,27 +58,11 @@ def test_a_pause_takes_no_time_of_the_recording(walk: Path, paused: bool, number
     assert len(stage.sent) == 60
 
 
-def test_the_position_is_that_in_the_recording(walk: Path) -> None:
-    stage, seen = Stage(walk, ALL, speed=2.0), []
-    for moment in (5.0, 10.0):
-        stage.at(moment, lambda: seen.append((stage.player.position_ns - THEN_NS) / 1e9))
-    stage.at(10.0, stage.player.pause)
-    stage.at(20.0, lambda: seen.append((stage.player.position_ns - THEN_NS) / 1e9)).at(20.0, stage.player.resume)
-    stage.run()
-    assert seen == pytest.approx([10, 20, 20], abs=0.2)
-
-
-@pytest.mark.parametrize(("to", "begins"), [(40.2, 41), (5.0, 5), (-20, 0), (1000, 60)])
+@pytest.mark.parametrize(("to", "begins"), [(40.2, 41), (-20, 0), (1000, 60)])
 def test_seek_goes_on_from_there(walk: Path, to: float, begins: int) -> None:
     stage = Stage(walk, ALL)
     stage.at(10.5, lambda: stage.player.seek(THEN_NS + int(to * 1e9))).run()
     assert numbers(stage) == [*range(11), *range(begins, 60)]
-
-
-def test_it_begins_and_ends_where_asked(walk: Path) -> None:
-    stage = Stage(walk, ALL, since_ns=THEN_NS + 20 * 10**9, until_ns=THEN_NS + 30 * 10**9).run()
-    assert numbers(stage) == list(range(20, 30))
-    assert stage.sent[0].at == 0
 
 
 def test_a_loop_begins_again(walk: Path) -> None:
@@ -105,15 +78,6 @@ def test_a_loop_of_one_message_is_no_flood(tmp_path: Path) -> None:
     assert 10 < len(stage.sent) <= 210
 
 
-def test_several_files_are_one_recording(tmp_path: Path) -> None:
-    paths = [
-        write(tmp_path / f"{name}.mcap", [Line(n, f"{GOOB}/outgoing/{name}", b"{}") for n in range(begin, 30, 2)])
-        for begin, name in enumerate(("logs", "audio"))
-    ]
-    stage = Stage(paths, ALL).run()
-    assert [topic.rpartition("/")[2] for topic in stage.topics] == ["logs", "audio"] * 15
-
-
 def test_an_empty_recording_ends(tmp_path: Path) -> None:
     assert Stage(write(tmp_path / "x.mcap", []), loop=True).run().sent == []
 
@@ -124,14 +88,6 @@ def test_what_is_refused_is_sent_again_and_nothing_is_lost(walk: Path) -> None:
     assert len(stage.sent) == 60
     assert stage.sent[10].at == pytest.approx(10.2, abs=0.06)
     assert stage.sent[11].at == pytest.approx(11, abs=0.06)
-
-
-def test_after_a_long_refusal_there_is_no_burst(walk: Path) -> None:
-    stage = Stage(walk, ALL)
-    stage.at(9.9, lambda: setattr(stage, "refuses", 2000)).run()
-    times = [sent.at for sent in stage.sent]
-    assert times[10] == pytest.approx(30, abs=1)
-    assert all(after - before > 0.45 for before, after in pairwise(times[10:]))
 
 
 def test_a_process_that_stood_still_sends_no_burst(walk: Path) -> None:

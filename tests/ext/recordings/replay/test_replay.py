@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -77,14 +76,6 @@ def meanwhile(job: Callable[[], object]) -> Iterator[None]:
     thread.join(20)
 
 
-def ends(process: subprocess.Popen[str], timeout: float = 20) -> tuple[int, str, str]:
-    try:
-        out, err = process.communicate(timeout=timeout)
-    finally:
-        process.kill()
-    return process.returncode, out, err
-
-
 def test_replayed_at_ten_times_its_speed_it_is_the_same(
     tmp_path: Path, operator: Reference, at: tuple[str, str], run: Run
 ) -> None:
@@ -130,8 +121,7 @@ def test_ctrl_c_leaves_nothing_that_moves(tmp_path: Path, operator: Reference, a
     process = program("replay", walk(tmp_path), *at, "--incoming")
     assert until(lambda: len(operator.of(LOGS)) > 2)
     process.send_signal(signal.SIGINT)
-    code, _, err = ends(process)
-    assert (code, err) == (0, "")
+    assert (process.communicate(timeout=20)[1], process.returncode) == ("", 0)
     assert until(lambda: states(operator)[-1] is False, 3)
     assert json.loads(operator.of(f"{REPLAYED}/incoming/drive-values")[-1])["valid_ms"] == 0
 
@@ -175,7 +165,6 @@ def test_a_broker_that_restarts_gets_the_rest(tmp_path: Path, run: Run) -> None:
     ("arguments", "problem"),
     [
         (("--incoming", "--speed", "0.5"), "--speed 0.5 would drive a robot for longer"),
-        (("--base", "pebble"), "--base pebble is the base of pebble/robots/goob itself"),
         (("--only", "other/#"), "no topic other/# in "),
         (("--only", "+/+/+/incoming/#"), "there is nothing to publish"),
         ((), "cannot connect"),
@@ -197,7 +186,6 @@ def test_what_damage_has_taken_is_counted(tmp_path: Path, at: tuple[str, str], r
     assert rewrite(path, mended).missing == 100
     assert run("replay", mended, *at, "--speed", "100") == 0
     assert run.err == "pebble: 100 messages are missing in this recording: files were damaged\n"
-    assert run.out.splitlines()[-1] == "300 sent, 0 skipped"
     assert run("replay", path, *at, "--speed", "100") == 1
     assert "1 damaged parts, 100 messages missing" in run.err
     assert run.out.splitlines()[-1] == "300 sent, 0 skipped"

@@ -2,32 +2,27 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
 from tests.commands.command_line import Run, config_file
-from tests.ext.foxglove.live import FRED, GOOB, Live, client, online
-from tests.ext.foxglove.watcher import Watcher
+from tests.ext.foxglove.live import FRED, GOOB, Live, Watcher, client, online
 from tests.support import Broker, until
 
 
 def test_which_robots_are_shown_has_to_be_named(run: Run, tmp_path: Path) -> None:
     assert run("foxglove") == 1
     assert run.err == ("pebble: which robots is missing: name either a robot's config file or --url mqtt://BROKER\n")
-    assert run("foxglove", config_file(tmp_path), "--url", "mqtt://127.0.0.1") == 1
-    assert "either" in run.err
     assert run("foxglove", config_file(tmp_path)) == 1
     assert run.err.startswith("pebble: services.mqtt_bridge.remote_mqtt.host: is not set")
     assert run("foxglove", "--url", f"zenoh:{tmp_path}") == 1
     assert run.err == "pebble: Foxglove needs the robots' broker: use --url mqtt://HOST[:PORT] or mqtts://…\n"
 
 
-@pytest.mark.parametrize("module", ["foxglove", "foxglove_schemas_protobuf.RawAudio_pb2"])
-def test_without_its_packages_one_line_names_the_extra(run: Run, module: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, module, None)
+def test_without_its_packages_one_line_names_the_extra(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "foxglove_schemas_protobuf.RawAudio_pb2", None)
     assert run("foxglove", "--url", "mqtt://127.0.0.1") == 1
     assert 'pip install "pebble-robot[foxglove]"' in run.err
     assert run.err.count("\n") == 1
@@ -39,7 +34,7 @@ def test_other_machines_are_let_in_only_with_two_options(run: Run, broker: Broke
     assert run.err.startswith("pebble: --host 0.0.0.0: other machines could watch and listen without a login")
     assert run.err.rstrip().endswith("add --no-login")
     server = Live(broker, "--host", "0.0.0.0", "--no-login")
-    _, errors, _ = server.end()
+    _, errors = server.end()
     assert "everybody on the network can watch and listen, without a login and unencrypted" in errors
 
 
@@ -56,16 +51,3 @@ def test_a_config_shows_its_robot_at_its_remote_broker(tmp_path: Path, broker: B
     assert list(watcher.channels) == [f"{GOOB}/outgoing/online"]
     server.end()
     robot.close()
-
-
-@pytest.mark.parametrize(
-    ("module", "absent"),
-    [
-        ("pebble.extensions.foxglove.command", {"foxglove", "google.protobuf", "av", "cv2"}),
-        ("pebble.extensions.foxglove.run", {"foxglove", "av", "starlette", "uvicorn", "websockets"}),
-    ],
-)
-def test_heavy_packages_are_imported_only_when_they_are_used(module: str, absent: set[str]) -> None:
-    code = f"import sys, {module}\nprint(sorted({absent!r} & set(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "[]\n"
