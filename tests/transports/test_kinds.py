@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from importlib.metadata import EntryPoint, EntryPoints
 
 import pytest
@@ -11,7 +9,6 @@ import pytest
 from pebble.errors import TransportError
 from pebble.transports import GROUP, State, create
 from pebble.transports.memory import MemoryHub, MemoryTransport
-from tests.support import ROOT
 
 
 class TheirTransport(MemoryTransport):
@@ -45,16 +42,3 @@ def test_what_is_not_a_transport_is_refused(monkeypatch: pytest.MonkeyPatch) -> 
     install(monkeypatch, "tests.transports.test_kinds:not_a_transport")
     with pytest.raises(TransportError, match="is not a pebble"):
         create("theirs", "client", None)
-
-
-def test_finding_a_kind_imports_no_other_client_library() -> None:
-    program = """
-import sys
-from pebble.transports import create, MqttSettings
-from pebble.transports.memory import MemoryHub
-create("memory", "client", MemoryHub())
-assert "paho" not in sys.modules and "zenoh" not in sys.modules, "memory needs no client library"
-create("mqtt", "client", MqttSettings(host="localhost"))
-assert "zenoh" not in sys.modules, "mqtt does not need zenoh"
-"""
-    subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=True, timeout=30)

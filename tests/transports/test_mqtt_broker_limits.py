@@ -1,17 +1,16 @@
-"""What an MQTT client makes of a broker without retained messages, QoS 1 or wills."""
+"""What an MQTT client makes of a broker without retained messages, QoS 1, wills or bridge mode."""
 
 from __future__ import annotations
 
-from itertools import product
 from pathlib import Path
 
 import pytest
 
 from pebble.transports import Message, MqttSettings, QoS, State
-from pebble.transports.mqtt.bridge_mode import Result
+from pebble.transports.mqtt.bridge_mode import BridgeMode, Result
 from pebble.transports.mqtt.broker_limits import EVERYTHING, BrokerLimits, Limits
 from pebble.transports.mqtt.transport import MqttTransport
-from tests.support import Broker, some, until
+from tests.support import Broker, until
 from tests.transports.received import Received
 
 NONE = Limits(retain=False, qos=0)
@@ -24,8 +23,6 @@ RESULTS |= {"no QoS": Result.QOS_REFUSED, "refuses": Result.FAILED}
     ("events", "limits"),
     [
         (["hangs up"] * 20, EVERYTHING),  # a proxy whose broker is away: no probe is accepted
-        (["hangs up", "probed"], EVERYTHING),
-        (["hangs up", "probed", "accepts"] * 5, EVERYTHING),
         (["hangs up", "probed", "hangs up"], NO_QOS),
         (["hangs up", "probed", *["hangs up"] * 2], NO_RETAIN),
         (["hangs up", "probed", *["hangs up"] * 3], NONE),
@@ -36,7 +33,6 @@ RESULTS |= {"no QoS": Result.QOS_REFUSED, "refuses": Result.FAILED}
         (["no retain"], NO_RETAIN),
         (["no QoS", "no retain", "accepts"], NONE),
         (["no retain", "accepts", "later"], EVERYTHING),  # it may have another config
-        (["refuses"] * 20, EVERYTHING),
     ],
 )
 def test_what_is_tried_next(events: list[str], limits: Limits) -> None:
@@ -56,33 +52,17 @@ def test_what_is_tried_next(events: list[str], limits: Limits) -> None:
     assert learning.limits == limits
 
 
-LACKING = [
-    (["retain_available false"], "keeps no retained messages"),
-    (["max_qos 0"], "has no QoS 1"),
-    (["retain_available false", "max_qos 0"], "keeps no retained messages"),
-    ([], ""),
-]
-
-
-CLIENTS = [("3.1.1", True), ("5", True), ("5", False)]  # without a will 3.1.1 tells nothing
-
-
 @pytest.mark.parametrize(
-    ("lacking", "client", "as_published"),
-    some(product(LACKING, CLIENTS, (True, False)), 5),
+    ("lacking", "protocol", "lost"),
+    [("retain_available false", "3.1.1", "keeps no retained messages"), ("max_qos 0", "5", "has no QoS 1")],
 )
 def test_messages_pass_both_ways_and_one_warning_names_what_is_lost(
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
-    lacking: tuple[list[str], str],
-    client: tuple[str, bool],
-    as_published: bool,
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, lacking: str, protocol: str, lost: str
 ) -> None:
-    (options, lost), (protocol, has_will) = lacking, client
-    broker = Broker(tmp_path, *options)
-    settings = MqttSettings(host="127.0.0.1", port=broker.port, protocol=protocol, as_published=as_published)
+    broker = Broker(tmp_path, lacking)
+    settings = MqttSettings(host="127.0.0.1", port=broker.port, protocol=protocol, as_published=True)
     will = Message("robot/online", b"gone", QoS.DELIVERED, retain=True)
-    robot = MqttTransport("robot", settings, will=will if has_will else None)
+    robot = MqttTransport("robot", settings, will=will)
     operator = MqttTransport("operator", MqttSettings(host="127.0.0.1", port=broker.port)).open()
     try:
         seen, commands = Received(), Received()
@@ -92,16 +72,42 @@ def test_messages_pass_both_ways_and_one_warning_names_what_is_lost(
         assert until(lambda: b"state" in seen.payloads)
         assert until(lambda: robot.publish("robot/event", b"event", qos=QoS.DELIVERED) and b"event" in seen.payloads)
         assert until(lambda: operator.publish("commands/stop", b"", urgent=True) and commands.payloads)
-        assert until(lambda: not lost or any(lost in record.getMessage() for record in caplog.records))
-        warned = [record.levelno for record in caplog.records if "that is changed" in record.getMessage()]
+        assert until(lambda: any(lost in line for line in caplog.messages))
+        warned = [line for line in caplog.messages if "that is changed" in line]
         assert len(warned) == ("retain" in lost)
         broker.stop()
         assert until(lambda: robot.state is not State.CONNECTED)
         broker.start()
         assert until(lambda: robot.state is State.CONNECTED)
         robot.close()
-        assert until(lambda: not has_will or b"gone" in seen.payloads)
+        assert until(lambda: b"gone" in seen.payloads)
     finally:
         robot.close()
         operator.close()
         broker.stop()
+
+
+ACCEPTED, PROTOCOL, HUNG_UP, OTHER = Result.ACCEPTED, Result.PROTOCOL_REFUSED, Result.HUNG_UP, Result.FAILED
+
+
+@pytest.mark.parametrize(
+    ("results", "attempts"),
+    [
+        ([PROTOCOL, OTHER], "bridge plain bridge"),
+        ([OTHER] * 4, "bridge bridge bridge bridge bridge"),  # a wrong password, say
+        ([HUNG_UP] * 6, "bridge probe bridge probe bridge probe bridge"),  # a proxy whose broker is away
+        ([HUNG_UP, ACCEPTED, ACCEPTED], "bridge probe bridge bridge"),  # the broker was just starting
+        ([HUNG_UP, ACCEPTED, OTHER, HUNG_UP], "bridge probe bridge bridge probe"),
+        ([HUNG_UP, ACCEPTED, HUNG_UP, ACCEPTED, HUNG_UP], "bridge probe bridge plain bridge plain"),  # remembered
+        ([PROTOCOL, ACCEPTED, HUNG_UP], "bridge plain bridge plain"),  # it is tried again with each connection
+        ([PROTOCOL, ACCEPTED, ACCEPTED, HUNG_UP], "bridge plain bridge bridge probe"),  # another broker
+    ],
+)
+def test_attempts_with_bridge_mode(results: list[Result], attempts: str) -> None:
+    """Those that end with ``results``, and the one after them."""
+    mode = BridgeMode()
+    made = []
+    for result in results:
+        made.append(mode.next_attempt.value)
+        mode.note(result)
+    assert [*made, mode.next_attempt.value] == attempts.split()

@@ -1,7 +1,8 @@
-"""A client against the other end of its socket, which does what no broker does on demand."""
+"""A client against the other end of its socket, which does what no broker does on demand; and its id."""
 
 from __future__ import annotations
 
+import re
 import select
 import socket
 import threading
@@ -16,6 +17,7 @@ from pebble.transports import MqttSettings
 from pebble.transports.hosts import addresses_of
 from pebble.transports.mqtt import packets
 from pebble.transports.mqtt.client import Client, Opening
+from pebble.transports.mqtt.client_ids import unique
 from tests.kit.mqtt_bytes import packet
 from tests.support import until
 from tests.transports.test_mqtt_packets import Noted
@@ -99,9 +101,8 @@ def test_no_more_is_in_flight_than_the_broker_takes(pairs: Any) -> None:
     assert len(pair.written()) == 2 * len(client_sent[0])
 
 
-@pytest.mark.parametrize("protocol", ["3.1.1", "5"])
-def test_what_the_socket_does_not_take_is_written_later_and_in_order(pairs: Any, protocol: str) -> None:
-    pair, numbers = pairs(protocol), range(40)
+def test_what_the_socket_does_not_take_is_written_later_and_in_order(pairs: Any) -> None:
+    pair, numbers = pairs("5"), range(40)
     for number in numbers:
         pair.client.publish("a", bytes([number]) * 200_000, 0, retain=False, expires_s=None)
     pair.client.ping()
@@ -116,8 +117,7 @@ def test_what_the_socket_does_not_take_is_written_later_and_in_order(pairs: Any,
 
     assert until(done, 20)
     expected = [
-        packets.publish("a", bytes([n]) * 200_000, 0, 0, retain=False, modern=protocol == "5", expires_s=None)
-        for n in numbers
+        packets.publish("a", bytes([n]) * 200_000, 0, 0, retain=False, modern=True, expires_s=None) for n in numbers
     ]
     assert bytes(arrived) == b"".join(expected) + packets.PINGREQ
     assert not pair.client.waiting
@@ -145,3 +145,22 @@ def test_a_client_that_leaves_closes_after_the_other_side(pairs: Any) -> None:
     assert pair.client.socket is None
     other.join()
     assert parts[-1] == b""
+
+
+@pytest.mark.parametrize(
+    ("name", "begins"),
+    [
+        ("pebble/robots/goob/remote_bridge", "pebble_robots_goob_remote_bridge-"),
+        ("a.b", "a_b-2e7336-"),
+        ("a_b", "a_b-"),
+        ("pebble/robots/größe", "pebble_robots_gr__e-9ce5d0-"),
+        ("\ud800", "_-"),
+        ("", "-"),
+    ],
+)
+def test_an_id_has_letters_digits_and_two_signs(name: str, begins: str) -> None:
+    first, second = unique(name), unique(name)
+    assert re.fullmatch(r"[A-Za-z0-9_-]*-[0-9a-f]{16}", first)
+    assert first.startswith(begins)
+    assert first[:-16] == second[:-16]
+    assert first != second

@@ -53,7 +53,6 @@ def test_a_socket_path_that_is_too_long_is_an_error_that_names_the_setting(tmp_p
 
 USERS: dict[str, Callable[[Path], object]] = {
     "peer": lambda folder: create("zenoh", "peer", ZenohSettings(run_dir=folder)).open(0.0),
-    "client": lambda folder: create("zenoh", "client", ZenohSettings(run_dir=folder, client=True)).open(0.0),
     "hub": lambda folder: ZenohHub(ZenohSettings(run_dir=folder)).open(),
     "reader": lambda folder: FrameReader(folder, "camera").open(),
     "writer": lambda folder: FrameWriter(folder, "camera", slots=2, capacity=100).open(),
@@ -108,11 +107,3 @@ def test_where_there_are_no_locks_the_reason_is_named(tmp_path: Path, monkeypatc
     for take in (FileLock.take, FileLock.wait):
         with pytest.raises(TransportError, match="cannot be locked: No locks available; set "):
             take(tmp_path / "lock")
-
-
-def test_a_presence_that_was_released_stays_so(tmp_path: Path) -> None:
-    presence = PeerRegistry(tmp_path).register("robot")
-    presence.release()
-    presence.ready()
-    presence.release()
-    assert list(tmp_path.iterdir()) == []

@@ -69,14 +69,6 @@ def test_a_damaged_file_is_set_aside_with_a_warning(
     assert read(path) == [b"new"]
 
 
-def test_it_reaches_the_disk_soon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(journal_module, "SYNC_S", 0.01)
-    journal = begun(tmp_path / "journal")
-    journal.put("a", b"reached")
-    assert until(lambda: b"reached" in (tmp_path / "journal").read_bytes())
-    journal.close()
-
-
 @needs_root
 def test_after_a_moment_of_full_disk_everything_is_written_again(
     caplog: pytest.LogCaptureFixture, tmp_path: Path
@@ -103,14 +95,11 @@ def test_after_a_moment_of_full_disk_everything_is_written_again(
         disk.unmount()
 
 
-@pytest.mark.parametrize("remove", [shutil.rmtree, lambda folder: folder.rename(folder.with_name("unmounted"))])
-def test_a_file_that_was_removed_is_written_anew(
-    tmp_path: Path, remove: Callable[[Path], object], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_that_was_removed_is_written_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(journal_module, "SYNC_S", 0.01)
     path = tmp_path / "state" / "journal"
     journal = begun(path)
-    remove(path.parent)
+    shutil.rmtree(path.parent)
     journal.put("b", b"two")
     assert until(lambda: journal.rewrite_at == 1030)
     journal.rewrite([("a", b"one"), ("b", b"two")])
@@ -118,9 +107,8 @@ def test_a_file_that_was_removed_is_written_anew(
     assert read(path) == [b"one", b"two"]
 
 
-@pytest.mark.parametrize("path", ["/proc/nowhere/journal", "/dev/null/journal"])
-def test_a_place_that_cannot_be_written_is_tried_again(path: str, caplog: pytest.LogCaptureFixture) -> None:
-    journal = begun(Path(path))
+def test_a_place_that_cannot_be_written_is_tried_again(caplog: pytest.LogCaptureFixture) -> None:
+    journal = begun(Path(path := "/dev/null/journal"))
     journal.put("a", b"not stored")
     assert caplog.text.count(path) == 1
     assert journal.rewrite_at == 1030

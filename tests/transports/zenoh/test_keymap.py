@@ -26,18 +26,18 @@ def random_topic(dice: random.Random) -> str:
 def test_keys_match_where_paho_matches_topics() -> None:
     dice = random.Random(1)
     matched = 0
-    for _ in range(10_000):
+    for _ in range(3_000):
         filter_, topic = random_filter(dice), random_topic(dice)
         wanted = topic_matches_sub(filter_, topic)
         matched += wanted
         have = zenoh.KeyExpr(filter_to_key(filter_)).intersects(zenoh.KeyExpr(topic_to_key(topic)))
         assert have == wanted, (filter_, topic)
-    assert matched > 150
+    assert matched > 40
 
 
 def test_every_topic_comes_back_and_no_two_share_a_key() -> None:
     dice = random.Random(2)
-    topics = {random_topic(dice) for _ in range(10_000)}
+    topics = {random_topic(dice) for _ in range(3_000)}
     keys = {topic_to_key(topic) for topic in topics}
     assert len(keys) == len(topics)
     assert {key_to_topic(key) for key in keys} == topics
@@ -45,7 +45,7 @@ def test_every_topic_comes_back_and_no_two_share_a_key() -> None:
 
 def test_keys_are_canonical_for_zenoh() -> None:
     dice = random.Random(3)
-    for _ in range(2000):
+    for _ in range(500):
         key = filter_to_key(random_filter(dice))
         assert str(zenoh.KeyExpr.autocanonize(key)) == key
 

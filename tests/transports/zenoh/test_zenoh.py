@@ -149,33 +149,23 @@ def test_live_traffic_does_not_need_the_hub(robot: Robot) -> None:
 
 
 def test_a_peer_that_starts_without_the_hub_talks_to_its_siblings_at_once(robot: Robot) -> None:
-    received: list[Message] = []
+    received, answers, late = Received(), Received(), Received()
     first = robot.client("first")
-    first.subscribe("from/+", received.append)
+    first.subscribe("from/+", received)
     robot.hub.kill()
     assert until(lambda: first.state is State.CONNECTING)
-    answers: list[Message] = []
     second = robot.client("second", timeout=0.2)
+    assert second.publish("from/second", b"1", qos=DELIVERED, retain=True)
     assert (second.state, str(robot.run_dir) in second.problem) == (State.CONNECTING, True)
-    second.subscribe("to/second", answers.append)
-    assert second.publish("from/second", b"1", qos=DELIVERED)
+    second.subscribe("to/second", answers)
     assert first.publish("to/second", b"2", qos=DELIVERED)
-    assert until(lambda: received and answers)
-
-
-def test_retained_messages_published_without_a_hub_arrive_live_and_reach_it_later(robot: Robot) -> None:
-    received: list[Message] = []
-    writer, reader = robot.client("writer"), robot.client("reader")
-    reader.subscribe("state", received.append)
-    robot.hub.kill()
-    assert until(lambda: writer.state is State.CONNECTING)
-    assert writer.publish("state", b"news", qos=DELIVERED, retain=True)
-    assert until(lambda: [(m.payload, m.retain) for m in received] == [(b"news", False)])
+    assert received.until(b"1")
+    assert answers.until(b"2")
     robot.hub.start()
-    assert until(lambda: [(m.payload, m.retain) for m in received] == [(b"news", False), (b"news", True)])
-    late: list[Message] = []
-    robot.client("late").subscribe("state", late.append)
-    assert until(lambda: [m.payload for m in late] == [b"news"])
+    assert received.until(b"1", b"1")
+    assert [message.retain for message in received.messages] == [False, True]
+    robot.client("late").subscribe("from/+", late)
+    assert late.until(b"1")
 
 
 def test_a_hub_whose_files_were_removed_ends(tmp_path: Path) -> None:
@@ -208,43 +198,22 @@ def test_peers_that_open_at_the_same_instant_receive_each_other(robot: Robot) ->
             client.close()
 
 
-def test_what_is_published_right_after_open_arrives_without_a_hub(robot: Robot) -> None:
-    client = robot.client("client")
-    received: list[Message] = []
-    client.subscribe("shot", received.append)
-    robot.hub.kill()
-    for number in range(1, 4):
-        shot = robot.actor("shot")
-        assert until(lambda: len(received) == number, 2)  # noqa: B023
-        shot.end()
-
-
 # -- siblings that hang
 
 
-@pytest.mark.parametrize(
-    ("count", "size", "pause_s", "longest_s", "slow"),
-    [
-        (500, 10, 0.0045, 0.25, 0),  # for longer than the lease of 2 s, after which the link is closed
-        (150, 100_000, 0.0, 1.5, 2),  # its sockets are full: a bounded wait, once
-    ],
-)
-def test_a_stopped_sibling_does_not_delay_the_others(
-    robot: Robot, count: int, size: int, pause_s: float, longest_s: float, slow: int
-) -> None:
+def test_a_stopped_sibling_does_not_delay_the_others(robot: Robot) -> None:
     sender = robot.client("sender")
     fast, stopped = robot.actor("listener"), robot.actor("listener")
     stopped.stop()
     times = []
-    for _ in range(count):
+    for _ in range(150):
         before = time.monotonic()
-        assert sender.publish("drive", bytes(size), qos=DELIVERED, urgent=pause_s > 0)
+        assert sender.publish("drive", bytes(100_000), qos=DELIVERED)
         times.append(time.monotonic() - before)
-        time.sleep(pause_s)
-    sender.publish("drive", b"end", qos=DELIVERED, urgent=pause_s > 0)
-    assert until(lambda: fast.ask() == f"{count + 1} end")
-    assert max(times) < longest_s
-    assert sum(seconds > 0.25 for seconds in times) <= slow
+    sender.publish("drive", b"end", qos=DELIVERED)
+    assert until(lambda: fast.ask() == "151 end")
+    assert max(times) < 1.5
+    assert sum(seconds > 0.25 for seconds in times) <= 2, "its sockets are full: a bounded wait, once"
     stopped.resume()
 
 
@@ -291,18 +260,6 @@ def test_a_hub_that_stands_still_holds_up_no_flood_it_does_not_listen_to(robot: 
     assert State.CONNECTING not in states, "its link was full, and closed for it"
 
 
-def test_a_stopped_sibling_is_waited_for_once(robot: Robot, caplog: pytest.LogCaptureFixture) -> None:
-    client, stopped = robot.client("client"), robot.actor("listener")
-    stopped.stop()
-    client.subscribe("a", print)
-    before = time.monotonic()
-    for topic in "bcdef":
-        client.subscribe(topic, print)
-    assert time.monotonic() - before < 0.5
-    assert "listener did not answer" in caplog.text
-    stopped.resume()
-
-
 def test_retained_state_missed_while_one_connection_was_down_comes_with_it(robot: Robot) -> None:
     """The connection to a sibling is closed under a flood while the hub's stays: only the hub has what we missed."""
     sender, stalled = robot.client("sender"), robot.actor("listener")
@@ -318,9 +275,6 @@ def test_retained_state_missed_while_one_connection_was_down_comes_with_it(robot
 
 def _links(transport: Any) -> int:
     return len(transport.session.info.links())
-
-
-# -- one topic, one order
 
 
 # -- wills and the journal
@@ -349,10 +303,6 @@ def test_the_will_of_one_who_died_with_the_hub_is_spoken_after_its_restart(remem
     mortal.kill()
     remembering.hub.start()
     assert until(lambda: [m.payload for m in received] == [b"dead"], 8)
-    remembering.hub.wait_until_stored()
-    remembering.hub.kill()
-    remembering.hub.start()
-    assert until(lambda: [(m.payload, m.retain) for m in received] == [(b"dead", False), (b"dead", True)], 8)
 
 
 # -- nothing open to the world
@@ -418,10 +368,9 @@ def test_a_hub_that_reaches_another_one_says_what_is_lost(tmp_path: Path, caplog
         assert until(lambda: caplog.text.count("another hub is connected to this one") == 2)
 
 
-@pytest.mark.parametrize("scheme", ["tls", "quic"])
-def test_only_certificates_with_an_allowed_name_get_through(tmp_path: Path, scheme: str) -> None:
+def test_only_certificates_with_an_allowed_name_get_through(tmp_path: Path) -> None:
     """The others have the same authority, and are connected."""
-    endpoint = f"{scheme}/localhost:{free_port()}"
+    endpoint = f"tls/localhost:{free_port()}"
     listening = {"listen": (endpoint,), "tls": _tls("server"), "allowed_names": ("client",)}
     local = ZenohSettings(run_dir=tmp_path / "run")
     elsewhere = ZenohSettings(run_dir=tmp_path / "other", connect=(endpoint,), client=True)
@@ -458,13 +407,10 @@ def _tls(name: str) -> TlsSettings:
 @pytest.mark.parametrize(
     ("changes", "complaint"),
     [
-        ({"listen": ("tcp/0.0.0.0:7447",)}, "unencrypted"),
         ({"connect": ("udp/192.168.0.5:7447",)}, "unencrypted"),
         ({"connect": ("tls/robot:7447",)}, "needs transport.tls"),
-        ({"run_dir": Path("/tmp") / ("x" * 100)}, "transport.run_dir"),
         ({"run_dir": Path("/tmp/a?b")}, "transport.run_dir"),
         ({"run_dir": Path("/proc/nowhere")}, "transport.run_dir"),
-        ({"listen": ("tls/0.0.0.0:7447",), "tls": TlsSettings()}, "without transport.tls.ca_cert anybody"),
         ({"listen": ("quic/0.0.0.0:7447",), "tls": TlsSettings()}, "without transport.tls.ca_cert anybody"),
         ({"listen": ("tls/nonsense",), "tls": TlsSettings(ca_cert=CERTIFICATES / "ca.crt")}, "zenoh"),
     ],
@@ -571,12 +517,9 @@ def test_a_message_that_waited_in_a_socket_too_long_is_dropped(robot: Robot, mon
     assert client.counters["late"] == 1
 
 
-@pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:{}", "tcp/localhost:{}", "tcp/127.0.0.1:{}#iface=lo"])
-def test_a_taken_port_keeps_no_robot_from_its_hub(
-    endpoint: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_taken_port_keeps_no_robot_from_its_hub(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with socket.create_server(("127.0.0.1", 0)) as stranger:
-        endpoint = endpoint.format(stranger.getsockname()[1])
+        endpoint = f"tcp/localhost:{stranger.getsockname()[1]}#iface=lo"
         settings = ZenohSettings(run_dir=tmp_path / "run", listen=(endpoint,))
         fact = f"transport.listen: {endpoint}: Address already in use (by process {os.getpid()} of user {os.getuid()}: "
         with pytest.raises(TransportError, match=re.escape(fact)):  # its endpoints are all that it is for

@@ -17,8 +17,7 @@ DELIVERED = QoS.DELIVERED
 
 
 def main(role: str, run_dir: str) -> None:
-    patience = 0.3 if role == "shot" else 5.0  # there is no hub for that one to wait for
-    client = create("zenoh", role, ZenohSettings(run_dir=Path(run_dir))).open(patience)
+    client = create("zenoh", role, ZenohSettings(run_dir=Path(run_dir))).open(5)
     globals()[role](client)
 
 
@@ -43,13 +42,6 @@ def talker(client: Transport) -> None:
 def _wait_to_be(stop_requested: threading.Event) -> None:
     sys.stdin.readline()
     stop_requested.set()
-
-
-def shot(client: Transport) -> None:
-    """Publishes once, right after it opened, and is gone."""
-    client.publish("shot", b"x", qos=DELIVERED)
-    client.close()
-    report("up")
 
 
 def pinger(client: Transport) -> None:
