@@ -123,6 +123,7 @@ class ProcessPeer:
         recipe = base64.b64encode(pickle.dumps((kind, name, settings, will))).decode()
         self._process = Forked("tests.transports.peer", recipe)
         assert self._answer() is True, "the peer did not connect"
+        self.pid = self._process.pid
 
     def publish(self, topic: str, payload: bytes, *, qos: QoS = QoS.DELIVERED, retain: bool = False) -> bool:
         return bool(self._ask({"topic": topic, "payload": payload.hex(), "qos": int(qos), "retain": retain}))

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
-import time
 from collections.abc import Callable, Iterator
-from threading import Event
 from types import SimpleNamespace
 from typing import Any
 
@@ -92,23 +90,6 @@ def test_when_all_fail_one_line_names_each_address_and_its_reason(
     )
     assert transport.problem.endswith("; and 6 more")
     assert [record.getMessage() for record in caplog.records] == [f"tool: {transport.problem}"]
-
-
-def test_close_does_not_wait_for_a_resolver(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked, go_on = Event(), Event()
-
-    def hang(*_: Any, **__: Any) -> None:
-        asked.set()
-        go_on.wait(10)
-        raise OSError("no answer")
-
-    monkeypatch.setattr(socket, "getaddrinfo", hang)
-    transport = create("mqtt", "tool", MqttSettings(host=NAME)).open(0.0)
-    assert asked.wait(5)
-    began = time.monotonic()
-    transport.close()
-    assert time.monotonic() - began < 1.0
-    go_on.set()
 
 
 A, B, C = (Address(socket.AF_INET, (f"10.0.0.{number}", 1883)) for number in (1, 2, 3))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections import Counter
 from collections.abc import Callable
 
@@ -11,7 +10,6 @@ import pytest
 from pebble.transports import Message
 from pebble.transports.mqtt.outgoing import InFlightTable
 from pebble.transports.mqtt.refused_topics import RefusedTopics
-from tests.support import further
 
 STEP_S = 0.02
 ROUND_TRIP_S = 0.04
@@ -104,10 +102,7 @@ def on(*topics: str) -> Refuses:
     return lambda topic, _size, _now: topic in topics
 
 
-@pytest.mark.parametrize(
-    "topics",
-    [("r/touch",), ("r/status",), further(("r/rare",)), ("r/touch", "r/status"), further(("r/imu", "r/charging"))],
-)
+@pytest.mark.parametrize("topics", [("r/rare",), ("r/touch", "r/status")])
 def test_what_a_broker_hangs_up_on_costs_that_topic(topics: tuple[str, ...]) -> None:
     link = Link(on(*topics)).run(300)
     assert set(link.topics.withheld) == set(topics) == set(link.topics.not_taken)
@@ -117,17 +112,7 @@ def test_what_a_broker_hangs_up_on_costs_that_topic(topics: tuple[str, ...]) -> 
     assert [topic for topic, share in rates.items() if topic not in topics and share < 0.9] == []
 
 
-def test_a_topic_that_is_allowed_again_is_used_again(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO)
-    link = Link(lambda topic, _size, now: topic == "r/touch" and now < 100).run(99)
-    assert set(link.topics.withheld) == {"r/touch"}
-    link.run(70)
-    assert not link.topics.withheld
-    assert "accepts messages on r/touch again" in caplog.messages[-1]
-    assert link.rates(10)["r/touch"] > 0.95
-
-
-@pytest.mark.parametrize("topic", ["r/online", "r/estop/wheels", "r/capabilities"])
+@pytest.mark.parametrize("topic", ["r/online", "r/estop/wheels"])
 def test_a_vital_topic_is_never_withheld_and_an_error_names_it(topic: str, caplog: pytest.LogCaptureFixture) -> None:
     link = Link(lambda name, _size, now: name == topic and now < 100).run(99)
     assert any("this account cannot run a robot" in line and topic in line for line in caplog.messages)
@@ -138,7 +123,7 @@ def test_a_vital_topic_is_never_withheld_and_an_error_names_it(topic: str, caplo
     assert min(link.rates(20).values()) > 0.9
 
 
-@pytest.mark.parametrize("topic", ["r/capabilities", "r/status", "r/imu"])
+@pytest.mark.parametrize("topic", ["r/capabilities", "r/imu"])
 def test_a_message_beyond_the_limit_of_a_broker_costs_only_messages_of_that_size(topic: str) -> None:
     link = Link(lambda _topic, size, _now: size > 10_000, **{topic[2:]: 24_000}).run(60)
     assert set(link.topics.withheld) == set(link.topics.not_taken) == {topic}
@@ -150,7 +135,7 @@ def test_a_message_beyond_the_limit_of_a_broker_costs_only_messages_of_that_size
     assert link.losses == losses
 
 
-@pytest.mark.parametrize("every_s", [0.1, 0.3, 1.0, further(3.0), 10.0])
+@pytest.mark.parametrize("every_s", [0.1, 1.0, 10.0])
 def test_a_link_that_is_lost_20_times_costs_topics_for_a_minute_at_most(every_s: float) -> None:
     link = Link(on(), every_s=every_s, losses=20).run(21 * (every_s + 0.12))
     assert link.losses == 20

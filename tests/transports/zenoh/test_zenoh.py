@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import re
@@ -28,10 +29,12 @@ from pebble.transports.zenoh import publishers, wire
 from pebble.transports.zenoh.hub import ZenohHub
 from tests.support import ROOT, free_port, until
 from tests.transports.forked import Forked
+from tests.transports.net import ProcessPeer
 from tests.transports.received import Received
 from tests.transports.zenoh_net import HubProcess, stranger_at
 
 DELIVERED = QoS.DELIVERED
+WILL = Message("will", b"dead", DELIVERED, True)
 CERTIFICATES = ROOT / "tests" / "data" / "tls"
 
 
@@ -104,6 +107,11 @@ class Robot:
         self._ends.append(actor.kill)
         return actor
 
+    def peer(self, name: str, *, will: Message | None = None) -> ProcessPeer:
+        peer = ProcessPeer("zenoh", name, self.settings, will)
+        self._ends.append(peer.kill)
+        return peer
+
     def end(self) -> None:
         for end in reversed(self._ends):
             end()
@@ -132,20 +140,24 @@ def remembering(tmp_path: Path) -> Iterator[Robot]:
 
 
 def test_live_traffic_does_not_need_the_hub(robot: Robot) -> None:
-    received: list[int] = []
-    client = robot.client("client")
-    client.subscribe("talk", lambda message: received.append(int(message.payload)))
-    talker = robot.actor("talker")
-    assert until(lambda: len(received) > 20)
+    received, numbers, spoken = Received(), itertools.count(), list[bytes]()
+    client, talker = robot.client("client"), robot.peer("talker")
+    client.subscribe("talk", received)
+
+    def talk() -> None:
+        for number in itertools.islice(numbers, 50):
+            spoken.append(b"%d" % number)
+            assert talker.publish("talk", spoken[-1])
+
+    talk()
     robot.hub.kill()
     assert until(lambda: client.state is State.CONNECTING)
-    seen = len(received)
-    assert until(lambda: len(received) > seen + 100)
+    talk()
+    assert received.until(*spoken)
     robot.hub.start()
+    talk()
     assert until(lambda: client.state is State.CONNECTED)
-    spoken = int(talker.ask())
-    assert until(lambda: len(received) >= spoken)
-    assert received == list(range(1, spoken + 1))
+    assert received.until(*spoken)
 
 
 def test_a_peer_that_starts_without_the_hub_talks_to_its_siblings_at_once(robot: Robot) -> None:
@@ -284,7 +296,7 @@ def test_a_will_survives_a_hub_without_a_journal(robot: Robot) -> None:
     received: list[Message] = []
     client = robot.client("client")
     client.subscribe("will", received.append)
-    mortal = robot.actor("killed")
+    mortal = robot.peer("mortal", will=WILL)
     robot.hub.kill()
     robot.hub.start()
     assert until(lambda: client.state is State.CONNECTED)
@@ -298,7 +310,7 @@ def test_the_will_of_one_who_died_with_the_hub_is_spoken_after_its_restart(remem
     received: list[Message] = []
     client = remembering.client("client")
     client.subscribe("will", received.append)
-    mortal = remembering.actor("killed")
+    mortal = remembering.peer("mortal", will=WILL)
     remembering.hub.kill()
     mortal.kill()
     remembering.hub.start()
@@ -310,8 +322,8 @@ def test_the_will_of_one_who_died_with_the_hub_is_spoken_after_its_restart(remem
 
 def test_nothing_listens_on_any_network(robot: Robot) -> None:
     """Processes of their own show it: sockets of this one may be those of other tests, or of a resolver's thread."""
-    talking, listening = robot.actor("pinger"), robot.actor("listener")
-    talking.ask("a")
+    talking, listening = robot.peer("talking"), robot.actor("listener")
+    assert talking.publish("a", b"x")
     assert until(lambda: listening.ask() == "1 x")
     assert _reachable(robot.hub.pid, talking.pid, listening.pid) == set()
     with socket.create_server(("127.0.0.1", 0)) as server, socket.socket(type=socket.SOCK_DGRAM) as datagrams:

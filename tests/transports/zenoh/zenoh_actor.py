@@ -26,33 +26,6 @@ def report(text: object) -> None:
     sys.stdout.flush()
 
 
-def talker(client: Transport) -> None:
-    """Numbers its messages at 200 Hz; reports how many."""
-    stop_requested, number = threading.Event(), 0
-    threading.Thread(target=_wait_to_be, args=(stop_requested,), daemon=True).start()
-    report("up")
-    while not stop_requested.wait(0.005):
-        number += 1
-        client.publish("talk", b"%d" % number, qos=DELIVERED)
-    report(number)
-    sys.stdin.readline()
-    client.close()
-
-
-def _wait_to_be(stop_requested: threading.Event) -> None:
-    sys.stdin.readline()
-    stop_requested.set()
-
-
-def pinger(client: Transport) -> None:
-    """Publishes at once on each topic that it reads from stdin."""
-    report("up")
-    for topic in sys.stdin:
-        client.publish(topic.strip(), b"x", qos=DELIVERED)
-        report("")
-    client.close()
-
-
 def listener(client: Transport) -> None:
     """Reports how many messages it has received and the last one, for each line on stdin."""
     received: list[Message] = []
@@ -61,15 +34,6 @@ def listener(client: Transport) -> None:
     for _ in sys.stdin:
         report(f"{len(received)} {received[-1].payload.decode() if received else ''}")
     client.close()
-
-
-def killed(client: Transport) -> None:
-    """Waits to be killed, with a will stored under the name of `client`."""
-    client.close()
-    with_will = create("zenoh", "killed", client.settings, will=Message("will", b"dead", DELIVERED, True))  # type: ignore[attr-defined]
-    with_will.open(5)
-    report("up")
-    sys.stdin.readline()
 
 
 def forks(client: Transport) -> None:
