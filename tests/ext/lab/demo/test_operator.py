@@ -7,8 +7,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, CONTROL, CONTROL_TAKE
-from pebble.extensions.lab.demo.operator import TRAIL, Operator
+from pebble.contract import CONTROL, CONTROL_TAKE
+from pebble.extensions.lab.demo.operator import Operator
 from tests.kit.played_robot import RecordingRobot
 from tests.support import Broker, until
 
@@ -20,15 +20,7 @@ START_S = 5.0
 @pytest.fixture
 def robot(broker: Broker) -> Iterator[RecordingRobot]:
     with RecordingRobot(broker.port, BASE, keeps=True) as running:
-        running.publish_capabilities(running.motors.value | {"autonomy": {"available": True}})
-        running.publish(AUTONOMY_FILES.metric, {"files": [{"file": TRAIL}], "timestamp": 1}, retain=True)
         yield running
-
-
-def scripts(robot: RecordingRobot) -> list[str | None]:
-    """Return what it was asked to run; None: to end it."""
-    topic = AUTONOMY_COMMAND.topic(BASE)
-    return [payload.get("file") for _, name, payload in list(robot.received) if name == topic]
 
 
 @pytest.fixture
@@ -56,14 +48,3 @@ def test_a_robot_that_a_person_has_taken_is_left_alone_until_the_step_after(
     assert until(lambda: robot.drives(taken + 0.1), START_S)
     assert operator.visitors.left_alone == {"goob"}
     assert [one for one in operator.completed if one.ended > taken > one.began] == []
-
-
-def test_a_robot_with_scripts_draws_its_trail_from_the_first_drive_on(
-    robot: RecordingRobot, operator: Operator
-) -> None:
-    operator.begin("yours")
-    assert until(lambda: robot.drives(0.0))
-    assert until(lambda: scripts(robot) == [TRAIL])  # two subscriptions: one may be a moment later
-    robot.publish(AUTONOMY_STATUS.metric, {"running": True, "timestamp": 1, "file": TRAIL})
-    assert until(lambda: len(scripts(robot)) > 1, 30.0)
-    assert scripts(robot)[:2] == [TRAIL, None], "it is ended before the emergency stop, which would make it fail"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from pebble.contract import CAPABILITIES, CONTROL_STATE, DRIVE, codec
-from pebble.contract.payloads import Capabilities, ControlState, Drive
+from pebble.contract import DRIVE, codec
+from pebble.contract.payloads import Drive
 from pebble.extensions.lab.demo.visitors import DRIVES_S, Visitors
 from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.transports import Message
@@ -36,25 +36,3 @@ def test_a_command_that_the_operator_has_not_sent_is_another_drivers(received: l
     assert visitors.left_alone == ({"goob"} if taken else set())
     visitors.begin_step(20.0)
     assert visitors.free(GOOB, 20.0)
-
-
-def test_a_page_that_has_control_and_a_pasted_command_both_keep_the_operator_away() -> None:
-    visitors, robot = Visitors("me"), RobotView(GOOB.base)
-
-    def publishes(by: str) -> None:
-        what = {"drive": {"control": True}, "estop": {"owners": ["serial"]}}
-        state = ControlState(by=by, id=by and "3f2a91c0", key=by and "0badf00d")
-        for channel, payload in ((CAPABILITIES, Capabilities(t=1, value=what)), (CONTROL_STATE, state)):
-            topic = channel.topic(robot.base).format(owner="serial")
-            robot.receive(channel, Message(topic, codec.encode(channel, payload)), 10.0, 10.0)
-
-    publishes("anna")
-    assert visitors.taken(robot, 10.0) == "is driven by anna"
-    assert visitors.rests(robot, 10.0), "it is not moved"
-    visitors.receive_drive(Message(TOPIC, PASTED), 20.0)
-    assert visitors.taken(robot, 20.0) == "is driven by anna"
-    assert not visitors.rests(robot, 20.0)
-    publishes("")
-    assert visitors.taken(robot, 20.0 + DRIVES_S / 2)
-    visitors.begin_step(30.0)
-    assert visitors.free(robot, 30.0)

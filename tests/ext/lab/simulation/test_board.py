@@ -5,10 +5,6 @@ from itertools import pairwise
 import pytest
 
 from pebble.extensions.lab.simulation.board import SimulatedMcu
-from pebble.extensions.lab.simulation.bodies import body_of
-from pebble.extensions.lab.simulation.micropython.board import Board
-from pebble.extensions.lab.simulation.micropython.clock import VirtualClock
-from pebble.extensions.lab.simulation.motion import FULL_SPEED_MM_S
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import END, Type, decode
 
 
@@ -47,20 +43,3 @@ def test_a_host_that_was_away_for_a_while_misses_no_sample() -> None:
     samples = [frame.timestamp for frame in frames if frame.type == Type.SAMPLE]
     assert [b - a for a, b in pairwise(samples)] == [10] * (len(samples) - 1)
     assert len(samples) >= 98
-
-
-def test_a_long_turn_reports_each_change_within_it() -> None:
-    clock = VirtualClock(50.0)
-    body = body_of("minilamp", Board(clock))
-    changes: list[tuple[float, tuple[float, float]]] = []
-    body.on_motors = lambda now, motors: changes.append((now, motors))
-    machine = body.board.firmware.module("machine")
-    for ahead, _ in (body.pins.LEFT, body.pins.RIGHT):
-        machine.PWM(machine.Pin(ahead), freq=1000, duty_u16=65535)
-    clock.advance(2.0)
-    body.board.pins.float_all()
-    clock.advance(3.0)
-    body.end_turn()
-    assert changes == [(50.0, (1.0, 1.0)), (52.0, (0.0, 0.0))]
-    body.advance()
-    assert body.motion.pose.x_mm == pytest.approx(2.0 * FULL_SPEED_MM_S, rel=0.01), "it rolled two seconds, not five"

@@ -42,20 +42,6 @@ class TestWlan:
         assert station.isconnected()
         assert station.ifconfig()[0] == "10.0.0.42"
 
-    @pytest.mark.parametrize("rejoins", [True, False])
-    def test_a_lost_access_point_comes_back(self, rejoins: bool) -> None:
-        clock = VirtualClock()
-        network = HostNetwork(clock)
-        station = joined(network)["network"].WLAN()
-        network.radio.rejoins = rejoins
-        network.radio.lose()
-        assert not station.isconnected()
-        network.radio.restore()
-        assert station.isconnected() is rejoins
-        station.disconnect()
-        station.connect("home", "secret")
-        assert station.isconnected()
-
 
 @pytest.fixture
 def listener() -> Iterator[socket.socket]:

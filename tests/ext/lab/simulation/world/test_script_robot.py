@@ -40,9 +40,3 @@ def test_a_script_for_which_time_stands_still_is_named(robot: SimulatedRobot) ->
 
     with pytest.raises(PebbleError, match=r"wait with robot\.sleep"):
         robot.run(main, seconds=1.0)
-
-
-def test_a_robot_that_is_not_in_the_world_is_named(tmp_path: Path) -> None:
-    (tmp_path / "world.json").write_text(json.dumps(WORLD))
-    with pytest.raises(PebbleError, match="there is no robot 'fred', only goob"):
-        SimulatedRobot(tmp_path / "world.json", "fred")

