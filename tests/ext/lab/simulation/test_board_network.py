@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from pebble.extensions.lab.simulation.micropython.clock import RealClock, VirtualClock
+from pebble.extensions.lab.simulation.micropython.clock import RealClock
 from pebble.extensions.lab.simulation.micropython.modules.sockets import HostNetwork
 from pebble.extensions.lab.simulation.micropython.modules.streams import POLLERR, POLLIN, POLLOUT
 from tests.support import free_port, until
@@ -24,23 +24,6 @@ def joined(network: Any) -> dict[str, Any]:
     station.connect("home", "secret")
     assert station.isconnected()
     return modules
-
-
-class TestWlan:
-    def test_joining_takes_a_while_and_a_second_request_meanwhile_is_an_error_on_an_esp32(self) -> None:
-        clock = VirtualClock()
-        modules = HostNetwork(clock).modules()
-        station = modules["network"].WLAN()
-        with pytest.raises(OSError, match="Not Started"):
-            station.connect("home", "secret")
-        station.active(True)
-        station.connect("home", "secret")
-        assert not station.isconnected()
-        with pytest.raises(OSError, match="Wifi Internal Error"):
-            station.connect("home", "secret")
-        clock.advance(1.0)
-        assert station.isconnected()
-        assert station.ifconfig()[0] == "10.0.0.42"
 
 
 @pytest.fixture

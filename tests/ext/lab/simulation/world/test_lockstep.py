@@ -9,7 +9,7 @@ import pytest
 
 from pebble.extensions.lab.simulation.world.lockstep import LockstepRobot, LockstepWorld
 from pebble.extensions.lab.simulation.world.world_file import World, parse_world
-from tests.ext.lab.simulation.world.worlds import CLEAR, projected, tags_in
+from tests.ext.lab.simulation.world.worlds import tags_in
 
 pytestmark = pytest.mark.computing
 
@@ -44,21 +44,3 @@ def history(seconds: float) -> str:
 
 def test_two_runs_are_the_same_to_the_last_bit() -> None:
     assert history(0.5) == history(0.5)
-
-
-def test_a_camera_with_latency_shows_what_was() -> None:
-    model = world(latency_ms=200.0, **CLEAR)
-    simulated = LockstepWorld(model)
-    goob = simulated.robots["goob"]
-    poses = {}
-    while simulated.now() < 1.0:
-        goob.drive(x=0.05, z=1.0)
-        simulated.step()
-        poses[round(simulated.now(), 3)] = goob.pose
-    picture = goob.picture()
-    assert picture is not None
-    assert picture.at == pytest.approx(0.8)
-    then = tuple(poses[0.8])
-    assert np.abs(tags_in(picture.pixels)[13] - projected(model, 13, then)).max() < 1.0  # type: ignore[arg-type]
-    now = tuple(poses[1.0])
-    assert np.abs(tags_in(picture.pixels)[13] - projected(model, 13, now)).max() > 2.0  # type: ignore[arg-type]

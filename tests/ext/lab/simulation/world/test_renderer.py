@@ -56,13 +56,6 @@ def test_walls_and_robots_hide_what_is_behind_them(keys: dict[str, Any], poses: 
     assert set(tags_in(seen(world_of(**keys), **poses))) == tags
 
 
-def test_of_a_drawing_only_its_shapes_are_seen_before_a_wall_of_its_own_colour() -> None:
-    triangle = {"colour": "#00c800", "points": [0, 1, 1, 1, 0.5, 0]}
-    drawing = {"x": 0.99, "y": 0, "z": 0.12, "yaw_deg": 180, "width_m": 0.4, "height_m": 0.4, "shapes": [triangle]}
-    picture = seen(world_of(walls=[{**WALL, "colour": "#6464ff"}], drawings=[drawing], camera=CLEAR))
-    assert [picture[240, x].tolist() for x in (320, 230, 100)] == [[0, 200, 0], [255, 100, 100], [255, 100, 100]]
-
-
 @pytest.mark.parametrize("heading", [0.0, 0.25 * math.pi, 1.5 * math.pi])
 def test_a_room_has_walls_all_around(heading: float) -> None:
     """At a wall that fills the picture, whatever the angle, no floor or sky is left in the middle rows."""

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from pebble import Robot
-from pebble.errors import PebbleError
 from pebble.extensions.lab.simulation.world.script_robot import SimulatedRobot
 
 WORLD = {"tags": [{"id": 13, "x": 3.0, "y": 0.0, "yaw_deg": 180.0}], "robots": {"goob": {"x": 0.0, "y": 0.0}}}
@@ -31,12 +30,3 @@ def test_a_script_moves_its_robot_and_leaves_it_at_rest(robot: SimulatedRobot) -
     before = robot.body.pose
     robot.world.run(1.0)
     assert robot.body.pose.x == pytest.approx(before.x, abs=0.03)
-
-
-def test_a_script_for_which_time_stands_still_is_named(robot: SimulatedRobot) -> None:
-    def main(robot: Robot) -> None:
-        while True:
-            robot.drive(z=0.1)
-
-    with pytest.raises(PebbleError, match=r"wait with robot\.sleep"):
-        robot.run(main, seconds=1.0)

@@ -7,9 +7,8 @@ from typing import Any
 
 import pytest
 
-from pebble.extensions.lab.simulation.motion import FULL_SPEED_MM_S, Pose
+from pebble.extensions.lab.simulation.motion import FULL_SPEED_MM_S
 from pebble.extensions.lab.simulation.world.lockstep import LockstepWorld
-from pebble.extensions.lab.simulation.world.walls import Floor
 from pebble.extensions.lab.simulation.world.world_file import parse_world
 from tests.ext.lab.simulation.world.worlds import world_of
 
@@ -58,12 +57,3 @@ def test_robots_stop_each_other_and_neither_is_pushed() -> None:
     driven(4.0, 1, 1, world)
     assert world.robots["fred"].pose == fred
     assert world.robots["goob"].pose.x == pytest.approx(0.8, abs=1e-4)
-
-
-def test_a_robot_that_was_put_into_a_wall_can_leave_it_but_not_go_deeper() -> None:
-    floor = Floor(world_of(walls=[WALL]))
-    inside = Pose(950.0, 0.0, 0.0)
-    floor.place("goob", inside)
-    assert floor.move("goob", inside, Pose(960.0, 0.0, 0.0)).x_mm == pytest.approx(950.0, abs=0.01)
-    floor.place("goob", inside)
-    assert floor.move("goob", inside, Pose(940.0, 0.0, 0.0)).x_mm == 940.0
