@@ -1,24 +1,28 @@
-"""A world whose time the test advances: repeatable to the last bit, faster than the real one."""
+"""A world whose time the test advances, repeatable to the last bit; and scripts on its clock, as they are."""
 
 from __future__ import annotations
 
 import hashlib
+import json
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from pebble import Robot
 from pebble.extensions.lab.simulation.world.lockstep import LockstepRobot, LockstepWorld
-from pebble.extensions.lab.simulation.world.world_file import World, parse_world
+from pebble.extensions.lab.simulation.world.script_robot import SimulatedRobot
+from pebble.extensions.lab.simulation.world.world_file import parse_world
 from tests.ext.lab.simulation.world.worlds import tags_in
 
 pytestmark = pytest.mark.computing
 
-TAG = {"id": 13, "x": 3.0, "y": 0.0, "yaw_deg": 180.0}
-
-
-def world(**camera: float) -> World:
-    robots = {"goob": {"x": 0.0, "y": 0.0, "tag": 1}, "fred": {"kind": "fred", "x": 1.0, "y": 0.6, "tag": 2}}
-    return parse_world({"tags": [TAG], "robots": robots, "camera": camera})
+WORLD: dict[str, Any] = {
+    "tags": [{"id": 13, "x": 3.0, "y": 0.0, "yaw_deg": 180.0}],
+    "robots": {"goob": {"x": 0.0, "y": 0.0}, "fred": {"kind": "fred", "x": 1.0, "y": 0.6, "tag": 2}},
+    "camera": {"latency_ms": 70.0, "motion_blur_ms": 20.0},
+}
 
 
 def follow(goob: LockstepRobot) -> bytes | np.ndarray:
@@ -32,7 +36,7 @@ def follow(goob: LockstepRobot) -> bytes | np.ndarray:
 
 
 def history(seconds: float) -> str:
-    simulated, digest = LockstepWorld(world(latency_ms=70.0, motion_blur_ms=20.0)), hashlib.sha256()
+    simulated, digest = LockstepWorld(parse_world(WORLD)), hashlib.sha256()
     goob, fred = simulated.robots.values()
     fred.write(b"M 0.5 0.1\n")
     while simulated.now() < seconds:
@@ -44,3 +48,18 @@ def history(seconds: float) -> str:
 
 def test_two_runs_are_the_same_to_the_last_bit() -> None:
     assert history(0.5) == history(0.5)
+
+
+def ahead(robot: Robot) -> None:
+    while robot.drive(z=0.5):
+        robot.sleep(0.1)
+
+
+def test_a_script_moves_its_robot_and_leaves_it_at_rest(tmp_path: Path) -> None:
+    (tmp_path / "world.json").write_text(json.dumps(WORLD))
+    robot = SimulatedRobot(tmp_path / "world.json")
+    robot.run(ahead, seconds=4.0)
+    assert robot.distance_to(tag=13) == pytest.approx(3.0 - 4.0 * 0.19, abs=0.03)
+    before = robot.body.pose
+    robot.world.run(1.0)
+    assert robot.body.pose.x == pytest.approx(before.x, abs=0.03)
