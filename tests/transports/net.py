@@ -128,6 +128,14 @@ class ProcessPeer:
     def publish(self, topic: str, payload: bytes, *, qos: QoS = QoS.DELIVERED, retain: bool = False) -> bool:
         return bool(self._ask({"topic": topic, "payload": payload.hex(), "qos": int(qos), "retain": retain}))
 
+    def listen(self) -> None:
+        """Subscribe to everything."""
+        self._ask({"listen": True})
+
+    def heard(self) -> Any:
+        """Return how many messages it has received, and the text of the last one."""
+        return self._ask({"heard": True})
+
     def kill(self) -> None:
         self._process.kill()
         self._process.wait(10)

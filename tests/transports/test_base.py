@@ -1,13 +1,15 @@
-"""Bounds and exact counts, which every kind of transport inherits and the shared suite does not reach."""
+"""Bounds, which every kind of transport inherits and the shared suite does not reach; and how kinds are found."""
 
 from __future__ import annotations
 
 import threading
 import tracemalloc
+from importlib.metadata import EntryPoint, EntryPoints
 
 import pytest
 
-from pebble.transports import Message, QoS, base, own_retained
+from pebble.errors import TransportError
+from pebble.transports import GROUP, Message, QoS, State, base, create, own_retained
 from pebble.transports.base import Subscriptions
 from pebble.transports.bounds import BoundedQueue, BoundedTable
 from pebble.transports.memory import MemoryHub, MemoryTransport
@@ -124,3 +126,39 @@ class TestTable:
         assert table.put_if_room("b", bytes(99))
         table.clear()
         assert table.put_if_room("c", bytes(99))
+
+
+# -- kinds
+
+
+class TheirTransport(MemoryTransport):
+    """A transport as a third party's package would define it."""
+
+
+def install(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
+    points = EntryPoints([EntryPoint(name="theirs", value=value, group=GROUP)])
+    monkeypatch.setattr("importlib.metadata.entry_points", points.select)
+
+
+def test_a_third_party_registers_through_an_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
+    install(monkeypatch, "tests.transports.test_base:TheirTransport")
+    with create("theirs", "client", MemoryHub()) as transport:
+        assert type(transport).__name__ == "TheirTransport"
+        assert transport.state is State.CONNECTED
+
+
+def test_an_unknown_kind_names_the_known_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    install(monkeypatch, "tests.transports.test_base:TheirTransport")
+    with pytest.raises(TransportError, match='no transport "carrier-pigeon": known are ') as refused:
+        create("carrier-pigeon", "client", None)
+    assert {"memory", "mqtt", "theirs", "zenoh"} <= set(str(refused.value).partition("known are ")[2].split(", "))
+
+
+def not_a_transport(client_id: str, settings: object, *, will: object) -> str:
+    return client_id
+
+
+def test_what_is_not_a_transport_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    install(monkeypatch, "tests.transports.test_base:not_a_transport")
+    with pytest.raises(TransportError, match="is not a pebble"):
+        create("theirs", "client", None)

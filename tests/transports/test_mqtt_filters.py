@@ -80,18 +80,6 @@ def retained(payload: bytes, topic: str = "flag") -> Message:
     return Message(topic, payload, retain=True)
 
 
-def test_own_messages_are_recognised_until_another_client_publishes_something_else() -> None:
-    own_filter = OwnMessageFilter()
-    own_filter.note_own(retained(b"true"))
-    assert own_filter.is_echo(retained(b"true"))
-    assert not own_filter.is_echo(retained(b"false"))
-    assert not own_filter.is_echo(retained(b"true"))
-    own_filter.note_own(retained(b"true"))
-    own_filter.begin()
-    assert own_filter.is_echo(retained(b"true"))
-    assert not own_filter.is_echo(retained(b"true", "other"))
-
-
 def test_a_copy_is_a_repeat_only_when_one_is_due() -> None:
     own_filter = OwnMessageFilter()
     assert not own_filter.is_repeat(retained(b"1"))

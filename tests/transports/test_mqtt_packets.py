@@ -213,16 +213,6 @@ class TestRead:
         assert [reader.read(2) for _ in range(4)] == [2, 2, 1, 0]
         assert len(noted.seen) == 5
 
-    def test_a_long_packet_in_small_pieces_is_copied_once(self) -> None:
-        long = packet(0x30, b"\0\1a" + bytes(MAX_PACKET - 3))
-        reader, copied = Reader(noted := Noted(), NO_QUOTA, modern=False), 0
-        for begin in range(0, len(long), 500):
-            reader.feed(long[begin : begin + 500])
-            copied += reader.unread
-            reader.read(64)
-        assert len(noted.seen) == 1
-        assert copied < 1.1 * len(long)
-
     @both_versions
     def test_each_other_packet(self, modern: bool) -> None:
         none = b"\0" if modern else b""

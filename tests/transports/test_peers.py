@@ -87,13 +87,6 @@ def test_a_full_disk_keeps_no_process_from_being_there(tmp_path: Path, monkeypat
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_is_no_lock_file_is_no_process(tmp_path: Path) -> None:
-    (tmp_path / "folder.seat").mkdir()
-    os.mkfifo(tmp_path / "pipe.seat")
-    (tmp_path / "link.seat").symlink_to(tmp_path / "nowhere")
-    assert PeerRegistry(tmp_path).sockets() == []
-
-
 def test_a_lock_that_cannot_be_made_is_one_line_with_a_remedy(tmp_path: Path) -> None:
     (tmp_path / "lock").mkdir()
     with pytest.raises(TransportError, match="/lock cannot be locked: Is a directory; remove it, or set "):

@@ -38,55 +38,53 @@ WILL = Message("will", b"dead", DELIVERED, True)
 CERTIFICATES = ROOT / "tests" / "data" / "tls"
 
 
-#: Roles that show how a program of its own ends; the others begin as forks of one that has imported everything.
-PROGRAMS = ("forks", "forks_with_a_lock")
+#: A child that may neither use its parent's session nor open one; or, with one more argument, ends as any program does
+#: while another thread of its parent holds a lock, for good.
+FORKS = """
+import os, sys, threading
+from pathlib import Path
+from pebble.errors import TransportError
+from pebble.transports import ZenohSettings, create
+
+def refused(attempt):
+    try:
+        attempt()
+    except TransportError as error:
+        return "spawn" in str(error)
+
+settings, held = ZenohSettings(run_dir=Path(sys.argv[1])), threading.Event()
+client = create("zenoh", "forks", settings).open(5)
+if locked := sys.argv[2:]:
+    client.on_state(lambda _state: (held.set(), threading.Event().wait()))
+    threading.Thread(target=client.close, daemon=True).start()
+    held.wait()
+if child := os.fork():
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    if locked:
+        os.execlp("sh", "sh", "-c", f"exit {code}")
+    client.close()
+    sys.exit(code)
+elif not locked:
+    attempts = (
+        lambda: client.publish("from/child", b""),
+        lambda: client.subscribe("to/child", print),
+        lambda: create("zenoh", "child", settings).open(1),
+    )
+    os.execlp("sh", "sh", "-c", f"exit {sum(map(refused, attempts))}")
+"""
 
 
-class Actor:
-    """A role of tests/transports/zenoh/zenoh_actor.py in its own process."""
+def stop(peer: ProcessPeer) -> None:
+    os.kill(peer.pid, signal.SIGSTOP)
+    assert until(lambda: Path(f"/proc/{peer.pid}/stat").read_text().split()[2] == "T")
 
-    def __init__(self, role: str, run_dir: Path) -> None:
-        module, pipe = "tests.transports.zenoh.zenoh_actor", subprocess.PIPE
-        command = [sys.executable, "-m", module, role, str(run_dir)]
-        self._process: Any = (
-            subprocess.Popen(command, cwd=ROOT, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True)
-            if role in PROGRAMS
-            else Forked(module, role, str(run_dir))
-        )
-        self.pid: int = self._process.pid
-        assert self.read() == "up"
 
-    def read(self) -> str:
-        return str(self._process.stdout.readline()).strip()
-
-    def ask(self, line: str = "") -> str:
-        self._process.stdin.write(f"{line}\n")
-        self._process.stdin.flush()
-        return self.read()
-
-    def stop(self) -> None:
-        """SIGSTOP, until `resume`."""
-        os.kill(self.pid, signal.SIGSTOP)
-        assert until(lambda: Path(f"/proc/{self.pid}/stat").read_text().split()[2] == "T")
-
-    def resume(self) -> None:
-        os.kill(self.pid, signal.SIGCONT)
-
-    def end(self) -> int | None:
-        """No further line: the role ends by itself. Returns its exit code."""
-        with contextlib.suppress(BrokenPipeError):
-            self._process.stdin.close()
-        code: int | None = self._process.wait(15)
-        self._process.stdout.close()
-        return code
-
-    def kill(self) -> None:
-        self._process.kill()
-        self.end()
+def resume(peer: ProcessPeer) -> None:
+    os.kill(peer.pid, signal.SIGCONT)
 
 
 class Robot:
-    """A run directory, its hub process, and the clients and actors of one test."""
+    """A run directory, its hub process, and the clients and peers of one test."""
 
     def __init__(self, folder: Path, *, journal: bool = False) -> None:
         self.run_dir = folder / "run"
@@ -102,14 +100,15 @@ class Robot:
         self._ends.append(client.close)
         return client.open(timeout)
 
-    def actor(self, role: str) -> Actor:
-        actor = Actor(role, self.run_dir)
-        self._ends.append(actor.kill)
-        return actor
-
     def peer(self, name: str, *, will: Message | None = None) -> ProcessPeer:
         peer = ProcessPeer("zenoh", name, self.settings, will)
         self._ends.append(peer.kill)
+        return peer
+
+    def listener(self) -> ProcessPeer:
+        """A process that receives everything."""
+        peer = self.peer("listener")
+        peer.listen()
         return peer
 
     def end(self) -> None:
@@ -215,18 +214,18 @@ def test_peers_that_open_at_the_same_instant_receive_each_other(robot: Robot) ->
 
 def test_a_stopped_sibling_does_not_delay_the_others(robot: Robot) -> None:
     sender = robot.client("sender")
-    fast, stopped = robot.actor("listener"), robot.actor("listener")
-    stopped.stop()
+    fast, stopped = robot.listener(), robot.listener()
+    stop(stopped)
     times = []
     for _ in range(150):
         before = time.monotonic()
         assert sender.publish("drive", bytes(100_000), qos=DELIVERED)
         times.append(time.monotonic() - before)
     sender.publish("drive", b"end", qos=DELIVERED)
-    assert until(lambda: fast.ask() == "151 end")
+    assert until(lambda: fast.heard() == [151, "end"])
     assert max(times) < 1.5
     assert sum(seconds > 0.25 for seconds in times) <= 2, "its sockets are full: a bounded wait, once"
-    stopped.resume()
+    resume(stopped)
 
 
 def test_more_topics_than_publishers_are_received_in_order(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -255,34 +254,17 @@ def test_topics_that_strangers_invent_take_no_memory(robot: Robot) -> None:
     assert pss_mb(hub) < before + 8.0
 
 
-def test_a_hub_that_stands_still_holds_up_no_flood_it_does_not_listen_to(robot: Robot) -> None:
-    sender, fast = robot.client("sender"), robot.actor("listener")
-    sender.publish("flood", b"first", qos=DELIVERED)
-    assert until(lambda: fast.ask() == "1 first")
-    sender.subscribe("other", lambda _message: None)  # synchronizes with the hub, whose declarations are known by then
-    states: list[State] = []
-    sender.on_state(states.append)
-    robot.hub.signal(signal.SIGSTOP)
-    for _ in range(100):
-        assert sender.publish("flood", bytes(100_000), qos=DELIVERED)
-    sender.publish("flood", b"end", qos=DELIVERED)
-    assert until(lambda: fast.ask().endswith(" end"))
-    robot.hub.signal(signal.SIGCONT)
-    robot.hub.wait_until_stored()
-    assert State.CONNECTING not in states, "its link was full, and closed for it"
-
-
 def test_retained_state_missed_while_one_connection_was_down_comes_with_it(robot: Robot) -> None:
     """The connection to a sibling is closed under a flood while the hub's stays: only the hub has what we missed."""
-    sender, stalled = robot.client("sender"), robot.actor("listener")
+    sender, stalled = robot.client("sender"), robot.listener()
     sender.publish("state", b"old", qos=DELIVERED, retain=True)
-    assert until(lambda: stalled.ask() == "1 old")
-    stalled.stop()
+    assert until(lambda: stalled.heard() == [1, "old"])
+    stop(stalled)
     while _links(sender) > 1:
         sender.publish("flood", bytes(100_000), qos=DELIVERED)
     sender.publish("state", b"new", qos=DELIVERED, retain=True)
-    stalled.resume()
-    assert until(lambda: stalled.ask().endswith(" new"))
+    resume(stalled)
+    assert until(lambda: stalled.heard()[1] == "new")
 
 
 def _links(transport: Any) -> int:
@@ -322,9 +304,9 @@ def test_the_will_of_one_who_died_with_the_hub_is_spoken_after_its_restart(remem
 
 def test_nothing_listens_on_any_network(robot: Robot) -> None:
     """Processes of their own show it: sockets of this one may be those of other tests, or of a resolver's thread."""
-    talking, listening = robot.peer("talking"), robot.actor("listener")
+    talking, listening = robot.peer("talking"), robot.listener()
     assert talking.publish("a", b"x")
-    assert until(lambda: listening.ask() == "1 x")
+    assert until(lambda: listening.heard() == [1, "x"])
     assert _reachable(robot.hub.pid, talking.pid, listening.pid) == set()
     with socket.create_server(("127.0.0.1", 0)) as server, socket.socket(type=socket.SOCK_DGRAM) as datagrams:
         datagrams.bind(("127.0.0.1", 0))
@@ -461,7 +443,7 @@ def test_no_thread_of_zenoh_takes_signals_away_from_the_main_thread(robot: Robot
 
 
 def test_what_the_killed_leave_is_cleared_away_by_the_next(robot: Robot) -> None:
-    robot.actor("listener").kill()
+    robot.listener().kill()
     assert len(list(robot.run_dir.glob("*.seat"))) == 1
     robot.hub.kill()
     assert (robot.run_dir / "hub.sock").exists()
@@ -474,14 +456,10 @@ def test_what_the_killed_leave_is_cleared_away_by_the_next(robot: Robot) -> None
     assert list(robot.run_dir.iterdir()) == []
 
 
-def test_a_fork_is_refused(robot: Robot) -> None:
-    actor = robot.actor("forks")
-    assert (actor.read(), actor.end()) == ("3", 0)
-
-
-def test_a_fork_ends_whatever_its_parent_was_doing(robot: Robot) -> None:
-    actor = robot.actor("forks_with_a_lock")
-    assert (actor.read(), actor.end()) == ("0", 0)
+@pytest.mark.parametrize(("locked", "code"), [([], 3), (["locked"], 0)])
+def test_a_fork_is_refused_and_ends_whatever_its_parent_was_doing(robot: Robot, locked: list[str], code: int) -> None:
+    command = [sys.executable, "-c", FORKS, str(robot.run_dir), *locked]
+    assert subprocess.run(command, cwd=ROOT, timeout=30, check=False).returncode == code
 
 
 # -- the hub
