@@ -246,22 +246,6 @@ class TestOriginal:
         assert bool(warning) == bool(expected)
         assert read(at("services.mqtt_bridge", {**bridge, "enabled": False})).warnings == ()
 
-    @pytest.mark.parametrize(
-        ("place", "value", "way_out"),
-        [
-            ("local_mqtt.keepalive", 60, "one value serves all robots"),
-            ("services.mqtt_bridge.log_level", "DEBUG", "the one of the file is for all services"),
-            ("services.av_daemon.env", {"A": "b"}, "systemctl edit pebble"),
-            ("services.video_stream.cwd", "/srv", "env -C FOLDER NAME=VALUE"),
-            ("services.mqtt_bridge.video_control", {"env": {"A": "b"}}, "services.mqtt_bridge.media configures them"),
-            ("services.mqtt_bridge.media.audio_receiver.rate", 8000, "each packet has its own"),
-        ],
-    )
-    def test_a_key_that_became_a_constant_loads_with_one_warning(self, place: str, value: Any, way_out: str) -> None:
-        (warning,) = [line for line in read(at(place, value)).warnings if "no longer used" in line]
-        assert warning.startswith(f"{place}: no longer used, ")
-        assert way_out in warning
-
 
 class TestOverridePoints:
     PATHS = tuple(one.override.removeprefix("services.") for one in CHANNELS if one.override is not None)
@@ -642,13 +626,6 @@ class TestWebInterface:
         warned = [] if local else [f"web_interface.host: other machines reach {host}"]
         assert [warning.partition(", ")[0] for warning in config.warnings] == warned
         assert read(at("web_interface", {"host": host, "plain_http": not local})).warnings == ()
-
-    def test_a_certificate_that_does_not_exist_yet_stops_the_page_and_not_the_robot(self) -> None:
-        config = read(at("web_interface.tls", {"certificate": "server.pem", "key": "server.key"}))
-        assert [line.partition("; ")[0] for line in config.warnings] == [
-            "web_interface.tls.certificate: there is no file /nowhere/server.pem",
-            "web_interface.tls.key: there is no file /nowhere/server.key",
-        ]
 
 
 class TestTls:

@@ -62,8 +62,6 @@ BAD = "mqtts://rover:s3cr3t@broker.example:8883"
                                                    "services.mqtt_bridge.remote_mqtt", "web_interface")),
         ("web_interface.names", [BAD]),
         ("transport.listen", ["tls/rover:s3cr3t@0.0.0.0:7447"]),
-        ("transport.connect", ["tcp/broker:s3cr3t"]),
-        ("services.mqtt_bridge.remote", {"kind": "zenoh", "connect": ["tls/mqtt://b:1"]}),
     ],
 )  # fmt: skip
 def test_every_key_that_names_a_host_reads_it_so(place: str, value: object) -> None:
@@ -95,7 +93,6 @@ def test_endpoints_and_names_of_the_page() -> None:
     ("url", "public", "warned"),
     [
         ("https://me:s3/cr3t@pit:88/x", "https://pit:88/x", "its login is left out"),
-        ("https://pit:88/@live", "https://pit:88/@live", ""),
         ("http://pit,b/x", "http://pit,b/x", "no page can show it"),
         ("/whep", "/whep", ""),
     ],

@@ -271,12 +271,6 @@ def test_a_section_that_is_nearly_one_of_ours_keeps_a_robot_from_starting(tmp_pa
         load(path, lenient=True)
 
 
-def test_of_a_refused_config_it_says_what_is_missing(tmp_path: Path) -> None:
-    path = write(tmp_path, {"lamp": {}}, {"hz": 2})
-    with pytest.raises(ConfigError, match=r"extensions.lamp: no installed package"):
-        load(path)
-
-
 def test_the_core_alone_reads_a_config_with_sections_of_extensions() -> None:
     config = load(ROOT / "configs" / "goob.json", core_only=True)
     names = [program.name for program in programs(config)]
