@@ -228,11 +228,9 @@ def test_bytes_without_a_payload_are_neither_empty_nor_a_bridges_probe(raw: byte
         (b'{"left":1,"right":1,"source":"joy"}', "joy", "'left', 'right', 'source'"),
         (b'{"value":{"speed":1,"source":"joy"},"z":1}', "joy", "'speed'"),
         (b"{}", "", "but nothing"),
-        (b'{"source":"autonomy","run":3}', "autonomy", "'source', 'run'"),
         (b'{"' + b"k" * 60_000 + b'":1}', "", "'kkkk"),
         (b'{"x\\u0000":1,"\\u001b[2J":1}', "", r"'\x1b[2J'"),
         (b'{"x":"0,5","z":0.5}', "", "x is '0,5', which is no number: it counts as 0"),
-        (b'{"x":"' + b"9!" * 30_000 + b'"}', "", "x is '9!9!"),
         *(
             (raw, None, "")
             for raw in (b'{"x":0}', b'{"z":0.5}', b'{"y":0}', b'{"\\u0078":0}', b'{"x":null}', b'{"z":"0"}')

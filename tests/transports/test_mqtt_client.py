@@ -101,29 +101,6 @@ def test_no_more_is_in_flight_than_the_broker_takes(pairs: Any) -> None:
     assert len(pair.written()) == 2 * len(client_sent[0])
 
 
-def test_what_the_socket_does_not_take_is_written_later_and_in_order(pairs: Any) -> None:
-    pair, numbers = pairs("5"), range(40)
-    for number in numbers:
-        pair.client.publish("a", bytes([number]) * 200_000, 0, retain=False, expires_s=None)
-    pair.client.ping()
-    assert pair.client.waiting
-    assert 0 < pair.client.unwritten < 40 * 200_100
-    arrived = bytearray()
-
-    def done() -> bool:
-        arrived.extend(pair.written())
-        pair.client.write()
-        return arrived.endswith(packets.PINGREQ)
-
-    assert until(done, 20)
-    expected = [
-        packets.publish("a", bytes([n]) * 200_000, 0, 0, retain=False, modern=True, expires_s=None) for n in numbers
-    ]
-    assert bytes(arrived) == b"".join(expected) + packets.PINGREQ
-    assert not pair.client.waiting
-    assert pair.client.unwritten == 0
-
-
 def test_a_client_that_leaves_closes_after_the_other_side(pairs: Any) -> None:
     """Else what that sends meanwhile has the connection reset, and a proxy may lose DISCONNECT with it."""
     pair, parts = pairs("3.1.1"), list[bytes]()

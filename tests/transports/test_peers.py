@@ -93,10 +93,3 @@ def test_a_lock_that_cannot_be_made_is_one_line_with_a_remedy(tmp_path: Path) ->
         FileLock.take(tmp_path / "lock")
     with pytest.raises(TransportError, match="File name too long; make room there, or set "):
         FileLock.take(tmp_path / ("x" * 300))
-
-
-def test_where_there_are_no_locks_the_reason_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fcntl.flock", refused(errno.ENOLCK))
-    for take in (FileLock.take, FileLock.wait):
-        with pytest.raises(TransportError, match="cannot be locked: No locks available; set "):
-            take(tmp_path / "lock")

@@ -11,7 +11,7 @@ import msgspec
 import pytest
 
 from pebble.errors import DeviceError
-from pebble.extensions.lab.simulation.world.pose_page import PosePage, PoseReader, page_path
+from pebble.extensions.lab.simulation.world.pose_page import PosePage, PoseReader
 from pebble.extensions.lab.simulation.world.poses import RobotPose, Sample, Track
 from tests.support import Child, until
 
@@ -81,13 +81,6 @@ def test_what_is_no_page_and_a_folder_that_others_may_write_are_refused(path: Pa
     path.parent.chmod(0o777)
     with pytest.raises(DeviceError, match="is not a folder that only you may write"):
         PosePage(path, ["goob"])
-
-
-def test_the_page_of_a_file_is_the_same_by_every_name_of_the_file(tmp_path: Path) -> None:
-    (tmp_path / "world.json").touch()
-    (tmp_path / "link.json").symlink_to("world.json")
-    assert page_path(tmp_path / "link.json") == page_path(tmp_path / "world.json")
-    assert page_path(tmp_path / "other.json") != page_path(tmp_path / "world.json")
 
 
 TRACK = Track([Sample(100, RobotPose(0, 0, 3.0)), Sample(200, RobotPose(1, -2, -3.0)), Sample(300, RobotPose(1, 0, 0))])
