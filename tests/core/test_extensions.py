@@ -17,9 +17,7 @@ from pebble.config import load, parse
 from pebble.config.types import Section
 from pebble.errors import ConfigError
 from pebble.extension import OURS, Command, Extension, Stage, lacking_packages, ours, part, programs_of
-from pebble.launcher.capabilities import capabilities
 from pebble.launcher.programs import programs
-from pebble.runtime.addresses import Addresses
 from tests.support import ROOT, needs_root, some
 
 PLACES = dict(zip([extension.name for extension in ours()], OURS, strict=True))
@@ -258,12 +256,6 @@ def test_help_is_there_although_two_packages_have_one_command(
         app.commands(["lamp"])
 
 
-def test_capabilities_of_the_rest_are_published_without_those_that_fail(tmp_path: Path) -> None:
-    (tmp_path / "lamp.py").write_text("def fail(*_): 1 / 0\n" + OBJECT % "offers='lamp:fail'")
-    config = load(write(tmp_path, {"lamp.py": {}}))
-    assert capabilities(config, Addresses(config))["identity"]["id"] == "goob"
-
-
 def test_a_section_that_is_nearly_one_of_ours_keeps_a_robot_from_starting(tmp_path: Path) -> None:
     path = write(tmp_path, {"absent.py": {}})
     path.write_text(json.dumps(json.loads(path.read_text()) | {"securty": {}}))
@@ -282,27 +274,6 @@ def test_an_owner_of_motors_is_a_device(tmp_path: Path) -> None:
     config = load(write(tmp_path, {"wheels.py": {"drives": True}}, {"enabled": True}))
     assert [(one.name, one.stage) for one in programs_of(config.installed, config)] == [("lamp", Stage.DEVICE)]
     assert config.motor_owners == ("lamp",)
-
-
-PROTOCOL = """
-from pebble.contract.serial_protocols import SerialProtocol
-from pebble.extension import Extension
-
-ROW = SerialProtocol("pebble.services.serial_mcu_bridge.imu.bridge:ImuBridge", is_imu=True)
-EXTENSION = Extension(name="gyro", package="gyro.py", protocols={"gyro_v1": ROW})
-"""
-
-
-def test_a_row_is_all_that_a_serial_protocol_needs_besides_its_service(tmp_path: Path) -> None:
-    (tmp_path / "gyro.py").write_text(PROTOCOL)
-    path = write(tmp_path, {"gyro.py": {}})
-    raw = json.loads(path.read_text())
-    line = {"enabled": True, "protocol": "gyro_v1", "serial": {"port": "/dev/gyro"}}
-    path.write_text(json.dumps(raw | {"services": {"serial_mcu_bridge": line}}))
-    done = pebble("check", str(path))
-    assert (done.returncode, done.stderr, "gyro_v1 at /dev/gyro" in done.stdout) == (0, "", True)
-    path.write_text(json.dumps(raw | {"services": {"serial_mcu_bridge": line | {"protocol": "gyro"}}}))
-    assert '"pebble_serial_v1" or "gyro_v1"' in pebble("check", str(path)).stderr
 
 
 LAMP_FILE, LEGS_FILE = LAMP % {"name": "lamp", "drives": False}, LAMP % {"name": "legs", "drives": True}
