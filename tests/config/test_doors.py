@@ -1,13 +1,14 @@
-"""What each security level refuses in a config, and what it lets pass; and the warning of a robot without logins."""
+"""What each security level refuses in a config; warnings of a robot without logins and of secrets others can read."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from pebble.config import parse
+from pebble.config import load, parse
 from pebble.config.raw import deep_merge
 from pebble.config.rules.doors import warning_of_open
 from pebble.errors import ConfigError
@@ -16,6 +17,7 @@ from tests.kit.configs import at
 REMOTE, UPLINK = "services.mqtt_bridge.remote_mqtt", "services.mqtt_bridge.remote"
 MIRROR, PAGE, DRIVE = "transport.mqtt_mirror", "web_interface.mqtt", "services.serial_mcu_bridge.topics.drive_values"
 TLS = {"enabled": True}
+ROVER = {"robot": {"id": "goob"}}
 LOGIN = {"username": "goob", "tls": TLS}
 GOOD: dict[str, Any] = {
     "robot": {"id": "goob"},
@@ -142,3 +144,77 @@ def test_a_robot_that_asks_for_no_name_is_warned_of_once(change: dict[str, Any],
 def test_drive_commands_without_control(security: dict[str, str], unnamed: str) -> None:
     config = parse(GOOD | {"security": security}, folder=Path("/nowhere"), env={})
     assert config.security.unnamed == unnamed
+
+
+# -- warnings of what lets others read or overhear a secret
+
+
+def written(folder: Path, mode: int, **keys: Any) -> Path:
+    path = folder / "robot.json"
+    path.write_text(json.dumps(ROVER | keys))
+    path.chmod(mode)
+    return path
+
+
+LOCAL = {"username": "ann", "password": "hunter2"}
+
+
+@pytest.mark.parametrize(
+    ("keys", "secret"),
+    [
+        ({"local_mqtt": LOCAL}, True),
+        ({"services": {"av_daemon": {"video": {"device": "rtsp://me:pw@cam.example/"}}}}, True),
+        ({"services": {"mqtt_bridge": {"reboot_control": {"env": {"API_KEY": "k"}}}}}, True),
+        ({"local_mqtt": {"username": "ann", "password_env": "PW"}}, False),
+    ],
+)
+@pytest.mark.parametrize(("mode", "open_"), [(0o644, True), (0o640, False)])
+def test_a_config_with_a_secret_that_everybody_can_read(
+    tmp_path: Path, keys: dict[str, Any], secret: bool, mode: int, open_: bool
+) -> None:
+    path = written(tmp_path, mode, **keys)
+    fix = f"run `chmod o-rwx {path}`"
+    text = f"(the whole file): every user of this machine can read it, and there is a password in it: {fix}"
+    assert load(path, env={"PW": "hunter2"}).warnings == (text,) * (secret and open_)
+
+
+def test_files_of_secrets_that_everybody_can_read(tmp_path: Path) -> None:
+    for name in ("password", "me.pem", "me.key", "page.pem", "page.key"):
+        (tmp_path / name).write_text("x")
+        (tmp_path / name).chmod(0o644)
+    tls = {"enabled": True, "client_cert": "me.pem", "client_key": "me.key"}
+    page = {"tls": {"certificate": "page.pem", "key": "page.key"}}
+    local = {"username": "ann", "password_file": "password", "tls": tls}
+    path = written(tmp_path, 0o644, local_mqtt=local, web_interface=page)
+    assert [line.partition(":")[0] for line in load(path, env={}).warnings] == [
+        "local_mqtt.tls.client_key",
+        "local_mqtt.password_file",
+        "web_interface.tls.key",
+    ]
+    for name in ("password", "me.key", "page.key"):
+        (tmp_path / name).chmod(0o640)
+    assert load(path, env={}).warnings == ()
+
+
+FAR = {"host": "broker.example", "username": "goob", "password": "hunter2", "client_id": "goob"}
+
+
+def uplink(**keys: Any) -> dict[str, Any]:
+    return {"services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": {**FAR, **keys}}}}
+
+
+@pytest.mark.parametrize(
+    ("keys", "where"),
+    [
+        ({"local_mqtt": {"tls": {"enabled": True, "insecure": True}}}, ["local_mqtt.tls.insecure"]),
+        ({"local_mqtt": {"tls": {"enabled": False, "insecure": True}}}, []),
+        ({**uplink(), "local_mqtt": LOCAL}, [f"{REMOTE}.username"]),  # its password crosses the network in clear
+        ({**uplink(tls=TLS), "local_mqtt": {**LOCAL, "host": "far"}, "transport": {"kind": "zenoh"}}, []),
+        # another account with this client id would end the connection
+        ({**uplink(tls=TLS), "security": {"level": "login"}}, [f"{REMOTE}.client_id"]),
+    ],
+)
+def test_a_connection_that_others_can_overhear_or_end(keys: dict[str, Any], where: list[str]) -> None:
+    assert [
+        warning.partition(":")[0] for warning in parse(ROVER | keys, folder=Path("/nowhere"), env={}).warnings
+    ] == where
