@@ -1,29 +1,36 @@
-"""What a client writes and reads is what paho writes and reads."""
+"""What a client writes and reads is what paho writes and reads; what it does where no broker would show it; its id."""
 
 from __future__ import annotations
 
 import random
+import re
 import select
 import socket
 import struct
 import threading
+import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from itertools import product
 from typing import Any
 
 import pytest
-from paho.mqtt.client import Client
+from paho.mqtt.client import Client as PahoClient
 from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
+from pebble.transports import MqttSettings
 from pebble.transports.base import Message, QoS
+from pebble.transports.hosts import addresses_of
 from pebble.transports.mqtt import packets, reasons
-from pebble.transports.mqtt.client import SendQuota
+from pebble.transports.mqtt.client import Client, Opening, SendQuota
+from pebble.transports.mqtt.client_ids import unique
 from pebble.transports.mqtt.packets import ANY_QOS, MAX_PACKET, RETAIN, Accepted, Filter, MalformedError, Reader
 from tests.kit.mqtt_bytes import packet
+from tests.support import until
 
 NO_QUOTA = SendQuota(lambda _packet: None)
 V3, V5 = MQTTProtocolVersion.MQTTv311, MQTTProtocolVersion.MQTTv5
@@ -35,7 +42,7 @@ both_versions = pytest.mark.parametrize("modern", [False, True])
 class Paho:
     """A client of paho's, and the other end of its connection."""
 
-    def __init__(self, client: Client, keepalive_s: int = 60) -> None:
+    def __init__(self, client: PahoClient, keepalive_s: int = 60) -> None:
         self.client = client
         with socket.create_server(("127.0.0.1", 0)) as server:
             client.connect(*server.getsockname(), keepalive_s)
@@ -72,7 +79,7 @@ def pahos() -> Iterator[Pahos]:
     made: list[Paho] = []
 
     def make(*, modern: bool, **options: Any) -> Paho:
-        made.append(Paho(Client(CallbackAPIVersion.VERSION2, protocol=V5 if modern else V3, **options)))
+        made.append(Paho(PahoClient(CallbackAPIVersion.VERSION2, protocol=V5 if modern else V3, **options)))
         return made[-1]
 
     yield make
@@ -118,7 +125,7 @@ class TestWritten:
     @pytest.mark.parametrize("login", [(None, None), ("user", None), ("user", "pässword"), (None, "unused")])
     @pytest.mark.parametrize("will", [None, Message("a/ü", b"\xffgone", QoS.DELIVERED, True), Message("b", b"")])
     def test_connect(self, modern: bool, login: tuple[str | None, str | None], will: Message | None) -> None:
-        client = Client(CallbackAPIVersion.VERSION2, protocol=V5 if modern else V3, client_id="goob-1")
+        client = PahoClient(CallbackAPIVersion.VERSION2, protocol=V5 if modern else V3, client_id="goob-1")
         client.username_pw_set(*login)
         if will is not None:
             client.will_set(will.topic, will.payload, int(will.qos), will.retain)
@@ -130,7 +137,7 @@ class TestWritten:
         paho.other.close()
 
     def test_bridge_mode(self) -> None:
-        client = Client(CallbackAPIVersion.VERSION2, protocol=V3, client_id="b")
+        client = PahoClient(CallbackAPIVersion.VERSION2, protocol=V3, client_id="b")
         client.enable_bridge_mode()
         options: Any = {"will": None, "username": None, "password": None}
         paho = Paho(client)
@@ -313,3 +320,127 @@ def test_reasons_are_called_as_paho_calls_them() -> None:
         name = ReasonCode(PacketTypes.DISCONNECT, identifier=0x80).names.get(code)
         if name is not None:
             assert reasons.words(code).lower() == next(iter(name)).lower()
+
+
+# -- against the other end of its socket
+
+
+RECEIVE_MAXIMUM_2 = packet(0x20, b"\0\0\3\x21\0\2")
+
+
+def opening(settings: MqttSettings) -> Opening:
+    return Opening("client", settings, None, None, addresses_of(settings.host, settings.port)[0])
+
+
+class Pair:
+    """A client, and the other end of its connection."""
+
+    def __init__(self, protocol: str) -> None:
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            settings = MqttSettings(host="127.0.0.1", port=server.getsockname()[1], protocol=protocol)
+            self.noted = Noted()
+            self.client = Client(opening(settings), self.noted, bridge=False)
+            self.client.open()
+            self.other, _ = server.accept()
+        self.other.settimeout(5)
+        self.hello = self.written()
+
+    def written(self) -> bytes:
+        """What has arrived at the other end."""
+        select.select([self.other], [], [], 1)
+        self.other.setblocking(False)
+        parts = []
+        try:
+            while part := self.other.recv(1 << 20):
+                parts.append(part)
+        except BlockingIOError:
+            pass
+        return b"".join(parts)
+
+    def sends(self, data: bytes) -> None:
+        """The other end does, and the client reads it."""
+        self.other.setblocking(True)
+        self.other.sendall(data)
+        assert until(lambda: self.client.receive() == len(data))
+        self.client.read(64)
+
+    def close(self) -> None:
+        self.client.close()
+        self.other.close()
+
+
+@pytest.fixture
+def pairs() -> Iterator[Any]:
+    with ExitStack() as made:
+
+        def make(protocol: str) -> Pair:
+            pair = Pair(protocol)
+            made.callback(pair.close)
+            return pair
+
+        yield make
+
+
+def publish(client: Client, number: int) -> None:
+    client.publish("a", b"%d" % number, 1, retain=False, expires_s=None)
+
+
+def test_no_more_is_in_flight_than_the_broker_takes(pairs: Any) -> None:
+    pair = pairs("5")
+    pair.sends(RECEIVE_MAXIMUM_2)
+    for number in range(5):
+        publish(pair.client, number)
+    client_sent = [
+        packets.publish("a", b"%d" % n, 1, n + 1, retain=False, modern=True, expires_s=None) for n in range(5)
+    ]
+    assert pair.written() == b"".join(client_sent[:2])
+    pair.sends(packet(0x40, b"\0\1"))
+    assert pair.written() == client_sent[2]
+    pair.sends(packet(0x40, b"\0\2") + packet(0x40, b"\0\3"))
+    assert pair.written() == b"".join(client_sent[3:])
+    pair.sends(packet(0x40, b"\0\4") + 5 * packet(0x40, b"\0\5"))  # more answers than were asked for allow no more
+    for number in range(3):
+        publish(pair.client, number)
+    assert len(pair.written()) == 2 * len(client_sent[0])
+
+
+def test_a_client_that_leaves_closes_after_the_other_side(pairs: Any) -> None:
+    """Else what that sends meanwhile has the connection reset, and a proxy may lose DISCONNECT with it."""
+    pair, parts = pairs("3.1.1"), list[bytes]()
+
+    def end() -> None:
+        while not b"".join(parts).endswith(packets.DISCONNECT):
+            parts.append(pair.other.recv(4096))
+        for _ in range(3):
+            pair.other.sendall(b"\xd0\0")
+            time.sleep(0.01)
+        parts.append(pair.other.recv(4096))  # a reset would raise
+        pair.other.close()
+
+    pair.other.setblocking(True)
+    other = threading.Thread(target=end)
+    other.start()
+    publish(pair.client, 1)
+    pair.client.disconnect()
+    assert pair.client.socket is None
+    other.join()
+    assert parts[-1] == b""
+
+
+@pytest.mark.parametrize(
+    ("name", "begins"),
+    [
+        ("pebble/robots/goob/remote_bridge", "pebble_robots_goob_remote_bridge-"),
+        ("a.b", "a_b-2e7336-"),
+        ("a_b", "a_b-"),
+        ("pebble/robots/größe", "pebble_robots_gr__e-9ce5d0-"),
+        ("\ud800", "_-"),
+        ("", "-"),
+    ],
+)
+def test_an_id_has_letters_digits_and_two_signs(name: str, begins: str) -> None:
+    first, second = unique(name), unique(name)
+    assert re.fullmatch(r"[A-Za-z0-9_-]*-[0-9a-f]{16}", first)
+    assert first.startswith(begins)
+    assert first[:-16] == second[:-16]
+    assert first != second
