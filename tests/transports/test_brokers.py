@@ -15,11 +15,9 @@ from pebble.extensions.operator.client.connection import Target, connected, subs
 from pebble.extensions.operator.client.discovery import ALL_OUTGOING, Discovery
 from pebble.transports import Message, MqttSettings, QoS
 from pebble.transports.mqtt.transport import MqttTransport
-from tests.forwarding.links.rig import MqttEnd, Rig, Side
 from tests.robot.operator import Operator
 from tests.robot.rig import BASE, STOP
 from tests.robot.rig import Rig as RobotRig
-from tests.services.mqtt_bridge.bridge_rig import Quiet
 from tests.sparing_broker import SparingBroker
 from tests.support import Broker, beside, until
 from tests.transports.brokers import MAKERS, ROBOT, Maker, sparing_aedes
@@ -27,7 +25,6 @@ from tests.transports.received import Received
 
 pytestmark = [pytest.mark.alone, pytest.mark.thorough]  # deadlines are checked; make long PART=brokers runs it
 
-FLAG = "incoming/flags/mqtt-audio"
 STOPPED = {"latched": True, "boot": "b", "count": 1, "recent": [], "by": "ann", "why": "", "since": 1}
 TRUE, FALSE = b'{"value": true}', b'{"value": false}'
 
@@ -64,25 +61,6 @@ def settings(broker: Broker, **more: Any) -> MqttSettings:
 @pytest.fixture
 def base(request: pytest.FixtureRequest) -> str:
     return f"pebble/robots/{request.node.originalname.rpartition('_')[2]}"
-
-
-def test_an_operators_flag_is_not_overwritten_by_a_robot_that_starts(broker: Broker, tmp_path: Path) -> None:
-    own = MqttEnd(tmp_path)
-    rig = Rig("bridge", own, MqttEnd(tmp_path, broker=broker))
-    try:
-        rig.local.publish(FLAG, TRUE, retain=True)
-        rig.remote.publish(FLAG, FALSE, retain=True)
-        for client in (rig.local, rig.remote):
-            client.transport.close()
-        rig.start()
-        Quiet(rig.client(Side.LOCAL)).wait(0.5)
-        assert rig.retained(Side.LOCAL)[FLAG] == FALSE
-        operator = rig.client(Side.REMOTE)
-        operator.transport.ask([f"{rig.base}/{FLAG}"])
-        assert until(lambda: {*operator.payloads(FLAG)} == {FALSE}), operator.payloads(FLAG)
-    finally:
-        rig.close()
-        own.close()
 
 
 def test_an_operators_tool_finds_the_states_of_an_idle_robot(maker: Maker, broker: Broker, base: str) -> None:

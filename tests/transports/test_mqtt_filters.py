@@ -10,7 +10,7 @@ import pytest
 
 from pebble.transports import Message
 from pebble.transports.mqtt import filters
-from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, cover, overlap
+from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, overlap
 from pebble.transports.topics import matches
 from tests.support import THOROUGH, some
 
@@ -38,12 +38,6 @@ def test_overlap_means_that_a_topic_matches_both() -> None:
     for one, other in some(itertools.combinations_with_replacement(FILTERS, 2), 3):
         wanted = bool(CAUGHT[one] & CAUGHT[other])
         assert overlap(one, other) is overlap(other, one) is wanted, (one, other)
-
-
-def test_a_cover_catches_what_both_catch() -> None:
-    for one, other in some(itertools.combinations(FILTERS, 2), 7):
-        if overlap(one, other):
-            assert CAUGHT[one] | CAUGHT[other] <= caught(cover(one, other)), (one, other)
 
 
 def test_subscribed_filters_never_overlap_and_miss_nothing() -> None:

@@ -85,11 +85,3 @@ def test_a_full_disk_keeps_no_process_from_being_there(tmp_path: Path, monkeypat
     assert registry.ready() == {lock.name: "?"}
     lock.release()
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_lock_that_cannot_be_made_is_one_line_with_a_remedy(tmp_path: Path) -> None:
-    (tmp_path / "lock").mkdir()
-    with pytest.raises(TransportError, match="/lock cannot be locked: Is a directory; remove it, or set "):
-        FileLock.take(tmp_path / "lock")
-    with pytest.raises(TransportError, match="File name too long; make room there, or set "):
-        FileLock.take(tmp_path / ("x" * 300))
