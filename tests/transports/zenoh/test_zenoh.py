@@ -14,7 +14,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,14 +24,13 @@ import zenoh
 
 from pebble.errors import TransportError
 from pebble.extensions.lab.bench.usage import pss_mb
-from pebble.transports import Message, QoS, State, TlsSettings, Transport, ZenohSettings, create
+from pebble.transports import Message, QoS, State, TlsSettings, ZenohSettings, create
 from pebble.transports.zenoh import publishers, wire
 from pebble.transports.zenoh.hub import ZenohHub
 from tests.support import ROOT, free_port, until
 from tests.transports.forked import Forked
-from tests.transports.net import ProcessPeer
 from tests.transports.received import Received
-from tests.transports.zenoh_net import HubProcess, stranger_at
+from tests.transports.zenoh_net import HubProcess, ZenohNet, stranger_at
 
 DELIVERED = QoS.DELIVERED
 WILL = Message("will", b"dead", DELIVERED, True)
@@ -74,71 +73,49 @@ elif not locked:
 """
 
 
-def stop(peer: ProcessPeer) -> None:
+def stop(peer: Any) -> None:
     os.kill(peer.pid, signal.SIGSTOP)
     assert until(lambda: Path(f"/proc/{peer.pid}/stat").read_text().split()[2] == "T")
 
 
-def resume(peer: ProcessPeer) -> None:
+def resume(peer: Any) -> None:
     os.kill(peer.pid, signal.SIGCONT)
 
 
-class Robot:
-    """A run directory, its hub process, and the clients and peers of one test."""
-
-    def __init__(self, folder: Path, *, journal: bool = False) -> None:
-        self.run_dir = folder / "run"
-        self.hub = HubProcess(self.run_dir, folder / "journal" if journal else None)
-        self._ends: list[Callable[[], Any]] = []
-
-    @property
-    def settings(self) -> ZenohSettings:
-        return self.hub.settings
-
-    def client(self, name: str, *, will: Message | None = None, timeout: float = 10, **changes: Any) -> Transport:
-        client = create("zenoh", name, replace(self.settings, **changes), will=will)
-        self._ends.append(client.close)
-        return client.open(timeout)
-
-    def peer(self, name: str, *, will: Message | None = None) -> ProcessPeer:
-        peer = ProcessPeer("zenoh", name, self.settings, will)
-        self._ends.append(peer.kill)
-        return peer
-
-    def listener(self) -> ProcessPeer:
-        """A process that receives everything."""
-        peer = self.peer("listener")
-        peer.listen()
-        return peer
-
-    def end(self) -> None:
-        for end in reversed(self._ends):
-            end()
-        if self.hub.running:
-            self.hub.kill()
+def listener(robot: ZenohNet) -> Any:
+    """Return a process that receives everything."""
+    peer: Any = robot.peer("listener")
+    peer.listen()
+    return peer
 
 
-@pytest.fixture
-def robot(tmp_path: Path) -> Iterator[Robot]:
-    robot = Robot(tmp_path)
-    robot.hub.start()
+def ended(robot: ZenohNet) -> Iterator[ZenohNet]:
+    """Run the robot's hub for a test."""
+    robot.start_network()
     yield robot
-    robot.end()
+    robot.close_clients()
+    if robot.hub.running:
+        robot.hub.kill()
 
 
 @pytest.fixture
-def remembering(tmp_path: Path) -> Iterator[Robot]:
+def robot(tmp_path: Path) -> Iterator[ZenohNet]:
+    """A robot whose hub keeps no journal."""
+    robot = ZenohNet(tmp_path)
+    robot.hub = HubProcess(tmp_path / "run")
+    yield from ended(robot)
+
+
+@pytest.fixture
+def remembering(tmp_path: Path) -> Iterator[ZenohNet]:
     """A robot whose hub keeps a journal."""
-    robot = Robot(tmp_path, journal=True)
-    robot.hub.start()
-    yield robot
-    robot.end()
+    yield from ended(ZenohNet(tmp_path))
 
 
 # -- no single point of failure
 
 
-def test_live_traffic_does_not_need_the_hub(robot: Robot) -> None:
+def test_live_traffic_does_not_need_the_hub(robot: ZenohNet) -> None:
     received, numbers, spoken = Received(), itertools.count(), list[bytes]()
     client, talker = robot.client("client"), robot.peer("talker")
     client.subscribe("talk", received)
@@ -159,15 +136,15 @@ def test_live_traffic_does_not_need_the_hub(robot: Robot) -> None:
     assert received.until(*spoken)
 
 
-def test_a_peer_that_starts_without_the_hub_talks_to_its_siblings_at_once(robot: Robot) -> None:
+def test_a_peer_that_starts_without_the_hub_talks_to_its_siblings_at_once(robot: ZenohNet) -> None:
     received, answers, late = Received(), Received(), Received()
     first = robot.client("first")
     first.subscribe("from/+", received)
     robot.hub.kill()
     assert until(lambda: first.state is State.CONNECTING)
-    second = robot.client("second", timeout=0.2)
+    second = robot.client("second", opened=False).open(0.2)
     assert second.publish("from/second", b"1", qos=DELIVERED, retain=True)
-    assert (second.state, str(robot.run_dir) in second.problem) == (State.CONNECTING, True)
+    assert (second.state, str(robot.hub.settings.run_dir) in second.problem) == (State.CONNECTING, True)
     second.subscribe("to/second", answers)
     assert first.publish("to/second", b"2", qos=DELIVERED)
     assert received.until(b"1")
@@ -187,10 +164,10 @@ def test_a_hub_whose_files_were_removed_ends(tmp_path: Path) -> None:
             hub.look()
 
 
-def test_peers_that_open_at_the_same_instant_receive_each_other(robot: Robot) -> None:
+def test_peers_that_open_at_the_same_instant_receive_each_other(robot: ZenohNet) -> None:
     for _ in range(5):
         received: dict[str, list[bytes]] = {name: [] for name in "abc"}
-        clients = {name: create("zenoh", name, robot.settings) for name in received}
+        clients = {name: create("zenoh", name, robot.settings()) for name in received}
         gate = threading.Barrier(len(clients))
 
         def come(name: str) -> None:
@@ -212,9 +189,9 @@ def test_peers_that_open_at_the_same_instant_receive_each_other(robot: Robot) ->
 # -- siblings that hang
 
 
-def test_a_stopped_sibling_does_not_delay_the_others(robot: Robot) -> None:
+def test_a_stopped_sibling_does_not_delay_the_others(robot: ZenohNet) -> None:
     sender = robot.client("sender")
-    fast, stopped = robot.listener(), robot.listener()
+    fast, stopped = listener(robot), listener(robot)
     stop(stopped)
     times = []
     for _ in range(150):
@@ -228,7 +205,7 @@ def test_a_stopped_sibling_does_not_delay_the_others(robot: Robot) -> None:
     resume(stopped)
 
 
-def test_more_topics_than_publishers_are_received_in_order(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_topics_than_publishers_are_received_in_order(robot: ZenohNet, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(publishers, "PUBLISHERS", 3)
     received: dict[str, list[int]] = {}
     robot.client("receiver").subscribe("many/+", lambda m: received.setdefault(m.topic, []).append(int(m.payload)))
@@ -239,7 +216,7 @@ def test_more_topics_than_publishers_are_received_in_order(robot: Robot, monkeyp
     assert received == {f"many/{topic}": list(range(topic, 70, 7)) for topic in range(7)}
 
 
-def test_topics_that_strangers_invent_take_no_memory(robot: Robot) -> None:
+def test_topics_that_strangers_invent_take_no_memory(robot: ZenohNet) -> None:
     """Zenoh stores 2.4 KB in the hub for each key that ever had a publisher: these would be 14 MB more."""
     sender, hub = robot.client("sender"), robot.hub.pid
     sender.policy.is_invented = lambda topic: topic != "invented/0"
@@ -254,9 +231,9 @@ def test_topics_that_strangers_invent_take_no_memory(robot: Robot) -> None:
     assert pss_mb(hub) < before + 8.0
 
 
-def test_retained_state_missed_while_one_connection_was_down_comes_with_it(robot: Robot) -> None:
+def test_retained_state_missed_while_one_connection_was_down_comes_with_it(robot: ZenohNet) -> None:
     """The connection to a sibling is closed under a flood while the hub's stays: only the hub has what we missed."""
-    sender, stalled = robot.client("sender"), robot.listener()
+    sender, stalled = robot.client("sender"), listener(robot)
     sender.publish("state", b"old", qos=DELIVERED, retain=True)
     assert until(lambda: stalled.heard() == [1, "old"])
     stop(stalled)
@@ -274,7 +251,7 @@ def _links(transport: Any) -> int:
 # -- wills and the journal
 
 
-def test_a_will_survives_a_hub_without_a_journal(robot: Robot) -> None:
+def test_a_will_survives_a_hub_without_a_journal(robot: ZenohNet) -> None:
     received: list[Message] = []
     client = robot.client("client")
     client.subscribe("will", received.append)
@@ -288,7 +265,7 @@ def test_a_will_survives_a_hub_without_a_journal(robot: Robot) -> None:
     assert until(lambda: [m.payload for m in received] == [b"dead"], 5)
 
 
-def test_the_will_of_one_who_died_with_the_hub_is_spoken_after_its_restart(remembering: Robot) -> None:
+def test_the_will_of_one_who_died_with_the_hub_is_spoken_after_its_restart(remembering: ZenohNet) -> None:
     received: list[Message] = []
     client = remembering.client("client")
     client.subscribe("will", received.append)
@@ -302,9 +279,10 @@ def test_the_will_of_one_who_died_with_the_hub_is_spoken_after_its_restart(remem
 # -- nothing open to the world
 
 
-def test_nothing_listens_on_any_network(robot: Robot) -> None:
+def test_nothing_listens_on_any_network(robot: ZenohNet) -> None:
     """Processes of their own show it: sockets of this one may be those of other tests, or of a resolver's thread."""
-    talking, listening = robot.peer("talking"), robot.listener()
+    talking: Any = robot.peer("talking")
+    listening = listener(robot)
     assert talking.publish("a", b"x")
     assert until(lambda: listening.heard() == [1, "x"])
     assert _reachable(robot.hub.pid, talking.pid, listening.pid) == set()
@@ -329,9 +307,9 @@ def _inodes_of(*pids: int) -> set[str]:
     return {link.removeprefix("socket:[").rstrip("]") for link in links if link.startswith("socket:")}
 
 
-def test_two_robots_linked_by_tls_share_one_link_and_no_more(robot: Robot, tmp_path: Path) -> None:
-    other = Robot(tmp_path / "other")
-    other.hub.start()
+def test_two_robots_linked_by_tls_share_one_link_and_no_more(robot: ZenohNet, tmp_path: Path) -> None:
+    other = ZenohNet(tmp_path / "other")
+    other.start_network()
     endpoint = f"tls/localhost:{free_port()}"
     try:
         server = robot.client("server", listen=(endpoint,), tls=_tls("server"))
@@ -347,7 +325,7 @@ def test_two_robots_linked_by_tls_share_one_link_and_no_more(robot: Robot, tmp_p
         assert until(lambda: b"end" in received.payloads and b"end" in bystander.payloads)
         assert (b"stranger" in received.payloads, bystander.payloads) == (False, [b"end"])
     finally:
-        other.end()
+        other.stop()
 
 
 def test_a_hub_that_reaches_another_one_says_what_is_lost(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -420,17 +398,17 @@ def test_settings_that_can_never_work_are_refused(tmp_path: Path, changes: dict[
 # -- nothing left behind
 
 
-def test_the_run_directory_is_private_and_empty_in_the_end(robot: Robot) -> None:
-    assert robot.run_dir.stat().st_mode & 0o777 == 0o700
+def test_the_run_directory_is_private_and_empty_in_the_end(robot: ZenohNet) -> None:
+    assert robot.hub.settings.run_dir.stat().st_mode & 0o777 == 0o700
     clients = [robot.client(name) for name in ("a", "b")] + [robot.client("tool", client=True)]
-    assert len(list(robot.run_dir.glob("*.sock"))) == 3
+    assert len(list(robot.hub.settings.run_dir.glob("*.sock"))) == 3
     for client in clients:
         client.close()
     assert robot.hub.end() == (0, "")
-    assert list(robot.run_dir.iterdir()) == []
+    assert list(robot.hub.settings.run_dir.iterdir()) == []
 
 
-def test_no_thread_of_zenoh_takes_signals_away_from_the_main_thread(robot: Robot) -> None:
+def test_no_thread_of_zenoh_takes_signals_away_from_the_main_thread(robot: ZenohNet) -> None:
     """A hub whose SIGTERM went elsewhere would wait for ever."""
     blocked = {
         (task / "comm").read_text().strip(): int((task / "status").read_text().split("SigBlk:")[1].split()[0], 16)
@@ -442,39 +420,41 @@ def test_no_thread_of_zenoh_takes_signals_away_from_the_main_thread(robot: Robot
     assert not blocked["python"] >> (signal.SIGTERM - 1) & 1
 
 
-def test_what_the_killed_leave_is_cleared_away_by_the_next(robot: Robot) -> None:
-    robot.listener().kill()
-    assert len(list(robot.run_dir.glob("*.seat"))) == 1
+def test_what_the_killed_leave_is_cleared_away_by_the_next(robot: ZenohNet) -> None:
+    listener(robot).kill()
+    assert len(list(robot.hub.settings.run_dir.glob("*.seat"))) == 1
     robot.hub.kill()
-    assert (robot.run_dir / "hub.sock").exists()
+    assert (robot.hub.settings.run_dir / "hub.sock").exists()
     robot.hub.start()
     client = robot.client("client")
     assert client.state is State.CONNECTED
-    assert len(list(robot.run_dir.glob("*.seat"))) == 1
+    assert len(list(robot.hub.settings.run_dir.glob("*.seat"))) == 1
     client.close()
     robot.hub.end()
-    assert list(robot.run_dir.iterdir()) == []
+    assert list(robot.hub.settings.run_dir.iterdir()) == []
 
 
 @pytest.mark.parametrize(("locked", "code"), [([], 3), (["locked"], 0)])
-def test_a_fork_is_refused_and_ends_whatever_its_parent_was_doing(robot: Robot, locked: list[str], code: int) -> None:
-    command = [sys.executable, "-c", FORKS, str(robot.run_dir), *locked]
+def test_a_fork_is_refused_and_ends_whatever_its_parent_was_doing(
+    robot: ZenohNet, locked: list[str], code: int
+) -> None:
+    command = [sys.executable, "-c", FORKS, str(robot.hub.settings.run_dir), *locked]
     assert subprocess.run(command, cwd=ROOT, timeout=30, check=False).returncode == code
 
 
 # -- the hub
 
 
-def test_a_second_hub_is_refused(robot: Robot) -> None:
+def test_a_second_hub_is_refused(robot: ZenohNet) -> None:
     with pytest.raises(TransportError, match=r"there is a hub .* already"):
-        ZenohHub(robot.settings).open()
-    second = Forked("pebble.extensions.lab.rig.hub", [json.dumps({"run_dir": str(robot.run_dir)})])
+        ZenohHub(robot.settings()).open()
+    second = Forked("pebble.extensions.lab.rig.hub", [json.dumps({"run_dir": str(robot.hub.settings.run_dir)})])
     assert second.wait(20) == 1
     assert "there is a hub for " in second.printed
     assert robot.client("client").state is State.CONNECTED
 
 
-def test_nonsense_does_not_disturb_the_hub(robot: Robot) -> None:
+def test_nonsense_does_not_disturb_the_hub(robot: ZenohNet) -> None:
     client = robot.client("client")
     session: zenoh.Session = client.session  # type: ignore[attr-defined]
     for stamp in (None, b"", b"\xff" * 9, b"\x05" + bytes(8) + b"name"):
@@ -488,7 +468,9 @@ def test_nonsense_does_not_disturb_the_hub(robot: Robot) -> None:
     assert until(lambda: [(m.topic, m.payload) for m in received] == [("sense", b"1")])
 
 
-def test_a_message_that_waited_in_a_socket_too_long_is_dropped(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_message_that_waited_in_a_socket_too_long_is_dropped(
+    robot: ZenohNet, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The age is that after a SIGSTOP of the receiver; retained messages are accepted: they are not sent again."""
     sender, client = robot.client("sender"), robot.client("client")
     received: list[Message] = []
