@@ -10,7 +10,7 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import closing
 from itertools import product
 from typing import Any
 
@@ -328,22 +328,17 @@ def test_reasons_are_called_as_paho_calls_them() -> None:
 RECEIVE_MAXIMUM_2 = packet(0x20, b"\0\0\3\x21\0\2")
 
 
-def opening(settings: MqttSettings) -> Opening:
-    return Opening("client", settings, None, None, addresses_of(settings.host, settings.port)[0])
-
-
 class Pair:
     """A client, and the other end of its connection."""
 
-    def __init__(self, protocol: str) -> None:
+    def __init__(self) -> None:
         with socket.create_server(("127.0.0.1", 0)) as server:
-            settings = MqttSettings(host="127.0.0.1", port=server.getsockname()[1], protocol=protocol)
-            self.noted = Noted()
-            self.client = Client(opening(settings), self.noted, bridge=False)
+            settings = MqttSettings(host="127.0.0.1", port=server.getsockname()[1], protocol="5")
+            opening = Opening("client", settings, None, None, addresses_of(settings.host, settings.port)[0])
+            self.client = Client(opening, Noted(), bridge=False)
             self.client.open()
             self.other, _ = server.accept()
-        self.other.settimeout(5)
-        self.hello = self.written()
+        self.written()  # CONNECT
 
     def written(self) -> bytes:
         """What has arrived at the other end."""
@@ -370,23 +365,16 @@ class Pair:
 
 
 @pytest.fixture
-def pairs() -> Iterator[Any]:
-    with ExitStack() as made:
-
-        def make(protocol: str) -> Pair:
-            pair = Pair(protocol)
-            made.callback(pair.close)
-            return pair
-
-        yield make
+def pair() -> Iterator[Pair]:
+    with closing(Pair()) as pair:
+        yield pair
 
 
 def publish(client: Client, number: int) -> None:
     client.publish("a", b"%d" % number, 1, retain=False, expires_s=None)
 
 
-def test_no_more_is_in_flight_than_the_broker_takes(pairs: Any) -> None:
-    pair = pairs("5")
+def test_no_more_is_in_flight_than_the_broker_takes(pair: Pair) -> None:
     pair.sends(RECEIVE_MAXIMUM_2)
     for number in range(5):
         publish(pair.client, number)
@@ -404,9 +392,9 @@ def test_no_more_is_in_flight_than_the_broker_takes(pairs: Any) -> None:
     assert len(pair.written()) == 2 * len(client_sent[0])
 
 
-def test_a_client_that_leaves_closes_after_the_other_side(pairs: Any) -> None:
+def test_a_client_that_leaves_closes_after_the_other_side(pair: Pair) -> None:
     """Else what that sends meanwhile has the connection reset, and a proxy may lose DISCONNECT with it."""
-    pair, parts = pairs("3.1.1"), list[bytes]()
+    parts = list[bytes]()
 
     def end() -> None:
         while not b"".join(parts).endswith(packets.DISCONNECT):
