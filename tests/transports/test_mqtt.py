@@ -306,6 +306,19 @@ def test_a_client_has_one_id_for_all_its_connections(tmp_path: Path, clients: Cl
     broker.stop()
 
 
+def test_two_clients_with_one_id_do_not_fight_at_full_speed(
+    broker: Broker, clients: Clients, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each throws the other out; without a pause that would be thousands of times a second."""
+    monkeypatch.setattr("secrets.token_hex", lambda size: "0" * 2 * size)
+    first = clients(broker.port, "twin", reconnect_max_s=0.2)
+    clients(broker.port, "twin", opened=False, reconnect_max_s=0.2).open(0.0)  # it may be thrown out again at once
+    assert until(lambda: first.counters["connected"] >= 3)
+    began, before = time.monotonic(), first.counters["connected"]
+    assert until(lambda: first.counters["connected"] >= before + 3)
+    assert time.monotonic() - began > 0.2
+
+
 # -- full sockets
 
 
