@@ -23,12 +23,11 @@ def main(recipe: str) -> None:
         if "listen" in request:
             client.subscribe("#", received.append)
             report(True)
-            continue
-        if "heard" in request:
+        elif "heard" in request:
             report([len(received), received[-1].payload.decode() if received else ""])
-            continue
-        payload = bytes.fromhex(request["payload"])
-        report(client.publish(request["topic"], payload, qos=QoS(request["qos"]), retain=request["retain"]))
+        else:
+            payload = bytes.fromhex(request["payload"])
+            report(client.publish(request["topic"], payload, qos=QoS(request["qos"]), retain=request["retain"]))
 
 
 def report(answer: object) -> None:
