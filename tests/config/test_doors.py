@@ -46,7 +46,6 @@ def problems(level: str, *changes: dict[str, Any]) -> list[str]:
         (at(f"{REMOTE}.tls.enabled", False), [f"{REMOTE}.tls.enabled"], []),
         (at(f"{REMOTE}.tls.insecure", True), [f"{REMOTE}.tls.insecure"], []),
         (at(REMOTE, {"host": "127.0.0.1", "tls": {"enabled": False}}), [], []),
-        (at(f"{REMOTE}.username", ""), [f"{REMOTE}.username"], []),
         (at("local_mqtt.host", "10.0.0.2"), [], []),  # not used: the transport is Zenoh
         (at(MIRROR, {"host": "10.0.0.2"}), [f"{MIRROR}.tls.enabled", f"{MIRROR}.username"], [f"{MIRROR}.host"]),
         (at(MIRROR, {"host": "127.0.0.1"}), [], []),
