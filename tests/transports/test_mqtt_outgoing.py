@@ -233,6 +233,19 @@ def test_what_is_delivered_was_sent_before_the_newest_answer_was_asked_for() -> 
         assert tuple(round(one, 3) for one in delay.delivery(now)) == delivered, now
 
 
+def test_answers_that_come_right_after_the_newest_ping_are_its() -> None:
+    near = delayed(0.001)
+    near.asked(0.0, clear=True)  # whose answer is lost
+    for number in range(1, 9):
+        near.asked(number / 2, clear=True)
+        assert at(near, number / 2, round_trip_s=0.0) >= 0.4
+        near.answered(number / 2 + 0.01)
+    assert at(near, 4.3, round_trip_s=0.0) == 0
+    near.asked(4.5, clear=True)
+    near.answered(4.51)
+    assert at(near, 4.9, round_trip_s=0.0) == 0
+
+
 def test_a_queue_of_constant_length_is_not_taken_for_lost_answers() -> None:
     """Pings are sent after 0.375 to 0.5 s; an answer behind others comes at any time after the newest."""
     usual_s = 0.05
