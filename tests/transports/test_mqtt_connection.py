@@ -270,6 +270,14 @@ def test_a_broker_without_qos_1_is_sent_no_more_than_its_socket_takes_but_stops(
     assert found == {"a": False, "stop": True}
 
 
+def test_a_packet_may_be_as_long_as_the_broker_has_said(link: Link) -> None:
+    link.connection.max_packet = 100
+    longest = next(size for size in range(100, 0, -1) if link.connection.takes(Message("a" * 20, bytes(size))))
+    for topic in ("a", "a" * 40):
+        sizes = [size for size in range(100) if link.connection.takes(Message(topic, bytes(size)))]
+        assert len(sizes) - 1 + len(topic) == longest + 20
+
+
 def test_a_packet_has_eight_filters_at_most_and_what_was_asked_is_named_when_the_connection_is_lost(link: Link) -> None:
     names = [f"t/{number}" for number in range(20)]
     link.connection.subscribe([(name, False) for name in names])
