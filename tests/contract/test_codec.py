@@ -67,13 +67,9 @@ SOUNDS: dict[bytes, dict[str, Any]] = {
     b'{"action": "play", "file": "a.wav"}': {"action": "play", "file": "a.wav"},
     b'{"enabled": true, "file": "a.wav"}': {"enabled": True, "file": "a.wav"},
     b'{"value": true, "file": "a.wav"}': {"enabled": True, "file": "a.wav"},
-    b'{"value": {"action": "play"}, "file": "a.wav"}': {"action": "play", "file": "a.wav"},
     b'{"value": {"action": "play", "file": "b"}, "file": "a"}': {"action": "play", "file": "b"},
-    b'{"action": "stop", "timestamp": 1.5e9}': {"action": "stop"},
     b'{"action": "play", "file": "a.wav", "repeat": true}': {"action": "play", "file": "a.wav", "repeat": True},
-    b'{"value": {"action": "play", "file": "b", "repeat": 3}}': {"action": "play", "file": "b", "repeat": 3},
     b'{"value": true, "file": "b", "repeat": 3}': {"enabled": True, "file": "b", "repeat": 3},
-    b'{"value": {"action": "play"}, "repeat": null}': {"action": "play", "repeat": None},
 }
 #: What a payload means.
 MEANINGS: list[tuple[Channel, bytes, Any]] = [
@@ -82,48 +78,35 @@ MEANINGS: list[tuple[Channel, bytes, Any]] = [
     (c.MQTT_VIDEO, b'{"value": false, "enabled": true}', False),
     # drive values: bare or wrapped numbers, or numeric strings
     (c.DRIVE, b'{"x": 0.2, "z": 0.5}', Drive(x=0.2, z=0.5)),
-    (c.DRIVE, b'{"value": {"x": 0.2, "z": 0.5}}', Drive(x=0.2, z=0.5)),
     (c.DRIVE, b'{"x": 0.2, "z": 0.5, "y": -1}', Drive(x=0.2, z=0.5, y=-1)),
-    (c.DRIVE, b'{"z": 1}', Drive(z=1)),
-    (c.DRIVE, b'{"x": 1}', Drive(x=1)),
     (c.DRIVE, b"{}", Drive()),
-    (c.DRIVE, b'{"value": {}}', Drive()),
     (c.DRIVE, b'{"x": "0.25", "z": " -1e-1 "}', Drive(x=0.25, z=-0.1)),
     (c.DRIVE, b'{"value": {"x": 1}, "x": -1, "z": 1}', Drive(x=1)),
     (c.DRIVE, b'{"value": null, "x": 0.5}', Drive(x=0.5)),
     (c.DRIVE, b'{"x": 7, "z": -7, "y": "1e9"}', Drive(x=1, z=-1, y=1)),
-    (c.DRIVE, b'{"x": 123456789012345678901234567890}', Drive(x=1)),
     (c.DRIVE, b'{"x": -1, "x": 1}', Drive(x=1)),
     (c.DRIVE, b'{"x": 1, "t": 1710969600123, "origin": {"a": [1]}}', Drive(x=1, t=1710969600123)),
     # their source, their run, and how long they are valid
     (c.DRIVE, b'{"z": 1, "source": "autonomy", "run": 17}', Drive(z=1, source="autonomy", run=17)),
-    (c.DRIVE, b'{"value": {"z": 1, "source": "autonomy", "run": 17}}', Drive(z=1, source="autonomy", run=17)),
     (c.DRIVE, b'{"z": 1, "source": "joystick", "valid_ms": 400}', Drive(z=1, source="joystick", valid_ms=400)),
     (c.DRIVE, b'{"z": 1, "source": null, "run": null, "valid_ms": null}', Drive(z=1)),
     (c.DRIVE, b'{"z": 1, "valid_ms": 250.9}', Drive(z=1, valid_ms=250)),
     (c.DRIVE, b'{"z": 1, "key": "0badf00d", "by": "otto"}', Drive(z=1, key="0badf00d", by="otto")),
     (c.DRIVE, b'{"z": "1", "key": "0badf00d", "t": 1, "group": true}', Drive(z=1, key="0badf00d", t=1, group=True)),
     (c.DRIVE, b'{"z": 1, "key": null, "t": -1, "by": 5, "group": "a"}', Drive(z=1)),
-    (c.DRIVE, b'{"z": 0, "key": 5}', Drive()),
     (c.DRIVE, b'{"z": 0, "valid_ms": 0}', Drive(valid_ms=0)),
-    (c.DRIVE, b'{"source": "autonomy", "run": 17}', Drive(source="autonomy", run=17)),
     # brackets in strings and side by side are not depth
     (c.DRIVE, json.dumps({"x": 1, "k": '\\"[{' * 100, "wide": [[]] * 100}).encode(), Drive(x=1)),
     # lights are clamped, missing colours are dark, and what is no period is the usual one
     (c.LIGHTS_SOLID, b'{"b": 2, "g": -1}', LightsSolid(b=1.0, g=0.0, r=0.0)),
-    (c.LIGHTS_SOLID, b'{"value": {"r": 0.5}}', LightsSolid(r=0.5)),
     (c.LIGHTS_FLASH, b'{"b": 1, "period": 0}', LightsFlash(b=1.0, period=0.05)),
-    (c.LIGHTS_FLASH, b"{}", LightsFlash(period=2.0)),
     (c.LIGHTS_FLASH, b'{"period": "3"}', LightsFlash(period=3.0)),
-    (c.LIGHTS_FLASH, b'{"period": null}', LightsFlash(period=2.0)),
     (c.LIGHTS_FLASH, b'{"period": "fast"}', LightsFlash(period=2.0)),
-    (c.LIGHTS_FLASH, b'{"period": "-1"}', LightsFlash(period=0.05)),
     (c.LIGHTS_FLASH, b'{"period": [], "b": "no"}', LightsFlash(period=2.0)),
     # a soundboard command is a boolean or an object
     *((c.SOUNDBOARD_COMMAND, raw, SoundboardCommand(**fields)) for raw, fields in SOUNDS.items()),
     (c.AUTONOMY_COMMAND, FOLLOW, FOLLOWS),
     (c.AUTONOMY_COMMAND, b'{"value": ' + FOLLOW + b"}", FOLLOWS),
-    (c.AUTONOMY_COMMAND, b"false", AutonomyCommand(enabled=False)),
     (c.OUTLET_COMMAND, b'{"value": {"on": false}}', OutletCommand(on=False)),
     (c.ESTOP_RESET, b'{"boot": "a1b2c3d4", "count": 3}', EstopReset(boot="a1b2c3d4", count=3)),
     (c.AUDIO_STREAM, b"PBAT\xff\x00", b"PBAT\xff\x00"),  # it is not looked into
@@ -137,9 +120,8 @@ def test_a_payload_has_its_value(channel: Channel, raw: bytes, value: Any) -> No
 
 #: Payloads that mean nothing.
 REFUSALS: dict[Channel, list[bytes]] = {
-    c.REBOOT: [b"1", b"0", b'"true"', b"null", b"[true]", b"{}", b'{"value": 1}', b'{"enabled": "on"}', b'{"on": true}',
-               b'{"value": {"value": true}}', b"TRUE", b"true false", b""],
-    c.DRIVE: [b"", b" ", b"null", b"[]", b"1", b'"x"', b"true", b'{"x": 1', b'{"x": 1}}', b"{'x': 1}"],
+    c.REBOOT: [b"1", b'"true"', b"{}", b'{"value": 1}', b'{"enabled": "on"}', b'{"value": {"value": true}}', b""],
+    c.DRIVE: [b"", b"null", b"[]", b"1", b'{"x": 1', b'{"x": 1}}'],
     c.LIGHTS_FLASH: [b'{"period": 1e999}', b'{"b": 1, "period": "inf"}', b"[1, 1, 1]", b'"1"'],
     c.SOUNDBOARD_COMMAND: [
         *(b'{"action": "play", "file": "a", "repeat": ' + number + b"}" for number in (b"-1", b'"yes"', b"0.5", b"[]")),
@@ -165,10 +147,10 @@ def test_a_payload_without_a_value_is_refused(channel: Channel, raw: bytes) -> N
 
 
 @pytest.mark.parametrize("channel", BOOLEANS, ids=lambda channel: channel.metric)
-@pytest.mark.parametrize("value", [True, False])
-@pytest.mark.parametrize("form", ["{}", '{{"value": {}}}', '{{"enabled": {}}}', '{{"value": 1, "enabled": {}}}'])
-def test_a_boolean_control_has_three_forms(channel: Channel, value: bool, form: str) -> None:
-    assert codec.decode(channel, form.format(json.dumps(value)).encode()) is value
+def test_a_boolean_control_has_three_forms(channel: Channel) -> None:
+    for form in ("{}", '{{"value": {}}}', '{{"enabled": {}}}', '{{"value": 1, "enabled": {}}}'):
+        assert codec.decode(channel, form.format("true").encode()) is True
+        assert codec.decode(channel, form.format("false").encode()) is False
 
 
 # -- drive values
@@ -177,17 +159,10 @@ def test_a_boolean_control_has_three_forms(channel: Channel, value: bool, form: 
 @pytest.mark.parametrize(
     ("key", "fields"),
     [
-        *(("source", f'"source": {wrong}') for wrong in ("5", '["autonomy"]', '{"a": 1}', "true")),
+        *(("source", f'"source": {wrong}') for wrong in ("5", '["autonomy"]')),
         ("run", '"source": "autonomy"'),
-        *(
-            ("run", f'"source": "autonomy", "run": {wrong}')
-            for wrong in ('"17"', "1.5", "true", "0", "-1", "1073741824")
-        ),
-        *(("valid_ms", f'"valid_ms": {wrong}') for wrong in ("0", "0.5")),
-        *(
-            ("valid_ms", f'"source": "autonomy", "run": 17, "valid_ms": {wrong}')
-            for wrong in ('"400"', "-1", "true", "1e300", 10**300)
-        ),
+        *(("run", f'"source": "autonomy", "run": {wrong}') for wrong in ('"17"', "1.5", "true", "0", "1073741824")),
+        *(("valid_ms", f'"valid_ms": {wrong}') for wrong in ("0", "0.5", '"400"', "-1", "true", "1e300", 10**300)),
     ],
 )
 def test_a_wrong_field_refuses_a_command_that_moves_and_never_a_stop(key: str, fields: str) -> None:
@@ -215,15 +190,10 @@ def test_numbers_may_be_text_and_what_is_none_is_0_but_nan_and_infinity_refuse_t
 COMMANDS = {
     c.DRIVE: ['{"x":0,"z":0}', '{"value":{"z":0.5}}', "{}"],
     c.ESTOP: ['{"stop":"c9a9f10cc9a9f10c","by":"eve"}'],
-    c.ESTOP_RESET: ['{"boot":"a1b2c3d4","count":3}'],
     c.CONTROL: ['{"id":"3f2a91c0","by":"ann"}', '{"value":{"id":"3f2a91c0","want":"release"}}'],
     c.LIGHTS_SOLID: ['{"b":0,"g":0,"r":0}'],
-    c.LIGHTS_FLASH: ['{"r":1,"period":"3"}'],
-    c.SOUNDBOARD_COMMAND: ["false", '{"action":"stop"}'],
     c.AUTONOMY_COMMAND: ["false", '{"value":{"action":"stop"}}'],
-    c.VIDEO_CONTROL: ["false", '{"enabled":false}'],
     c.AUDIO_CONTROL: ["false"],
-    c.OUTLET_COMMAND: ['{"on":false}'],
     c.ONLINE: ['{"t":1,"online":false}'],
     **{channel: ["false", '{"value":false}'] for channel in BOOLEANS},
 }
@@ -237,14 +207,14 @@ def test_bytes_around_a_payload_change_nothing(before: str, after: str) -> None:
             assert codec.decode(channel, raw) == codec.decode(channel, text.encode()), channel.metric
 
 
-@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be", "utf-32"])
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le"])
 def test_utf_16_is_refused_with_the_reason_and_an_emergency_stop_in_it_stops(encoding: str) -> None:
     assert "send UTF-8" in refused(c.DRIVE, '{"x":0,"z":0}'.encode(encoding))
     assert "send UTF-8" in refused(c.REMOTE_MIRROR, "false".encode(encoding))
     assert codec.decode(c.ESTOP, '{"stop":"c9a9f10cc9a9f10c"}'.encode(encoding)) == EstopCommand()
 
 
-@pytest.mark.parametrize("raw", [b"\0", b"\xef\xbb\xbf", b"\0 \r\n", b"\xff\xfe"])
+@pytest.mark.parametrize("raw", [b"\0", b"\xef\xbb\xbf"])
 def test_bytes_without_a_payload_are_neither_empty_nor_a_bridges_probe(raw: bytes) -> None:
     refused(c.REMOTE_MIRROR, raw)
     assert not codec.is_blank(raw)
@@ -255,18 +225,12 @@ def test_bytes_without_a_payload_are_neither_empty_nor_a_bridges_probe(raw: byte
     ("raw", "sender", "words"),
     [
         (b'{"linear":{"x":0.5,"y":0,"z":0},"angular":{"z":1}}', "", "'linear', 'angular'"),
-        (b'{"X":0.5,"Z":1}', "", "'X', 'Z'"),
         (b'{"left":1,"right":1,"source":"joy"}', "joy", "'left', 'right', 'source'"),
         (b'{"value":{"speed":1,"source":"joy"},"z":1}', "joy", "'speed'"),
-        (b'{"value":{},"z":1}', "", "but nothing"),
         (b"{}", "", "but nothing"),
-        (b'{"source":"autonomy","run":3}', "autonomy", "'source', 'run'"),
-        (b'{"source":7}', "", "'source'"),
         (b'{"' + b"k" * 60_000 + b'":1}', "", "'kkkk"),
         (b'{"x\\u0000":1,"\\u001b[2J":1}', "", r"'\x1b[2J'"),
         (b'{"x":"0,5","z":0.5}', "", "x is '0,5', which is no number: it counts as 0"),
-        (b'{"x":true}', "", "x is a boolean"),
-        (b'{"x":"' + b"9!" * 30_000 + b'"}', "", "x is '9!9!"),
         *(
             (raw, None, "")
             for raw in (b'{"x":0}', b'{"z":0.5}', b'{"y":0}', b'{"\\u0078":0}', b'{"x":null}', b'{"z":"0"}')
@@ -287,10 +251,6 @@ def test_a_drive_command_that_may_not_mean_what_it_does_is_remarked_upon(
         assert text.isprintable()
 
 
-def test_a_long_string_of_digits_costs_no_time() -> None:
-    assert not codec.decode(c.DRIVE, b'{"x": "' + b"1" * 60_000 + b'!"}').moves
-
-
 # -- limits that hold for every command
 
 
@@ -299,23 +259,20 @@ UNREADABLE = [
     b'{"k": "\xff"}',
     b'{"k": "\xed\xa0\x80"}',
     b'{"\xc0\xaf": 1}',
-    b'{"k": "\\ud800"}',
     b'{"\\udc00": 1}',
-    b'{"k": "\x00"}',
     b'\xef{"x": \xbb1}',
     b'{"k": NaN}',
     b'{"k": 1e999}',
     b'{"k": ' + b"9" * 5000 + b"}",
     b"[" * 60_000,
-    b'{"k":' * 10_000,
     b" \t\n" * 8,  # by such payloads bridges look for cycles
 ]
 
 
 @pytest.mark.parametrize("channel", [one for one in JSON_COMMANDS if one is not c.ESTOP], ids=lambda one: one.metric)
-@pytest.mark.parametrize("raw", UNREADABLE)
-def test_invalid_json_is_refused_even_in_keys_that_are_not_read(channel: Channel, raw: bytes) -> None:
-    assert refused(channel, raw).startswith(channel.metric)
+def test_invalid_json_is_refused_even_in_keys_that_are_not_read(channel: Channel) -> None:
+    for raw in UNREADABLE:
+        assert refused(channel, raw).startswith(channel.metric)
 
 
 #: A stop, and what it means: one that cannot be read, or whose name is none, has none.
@@ -345,7 +302,6 @@ def test_any_payload_is_a_stop(raw: bytes, stop: EstopCommand) -> None:
         (b'{"id": "3F2A91C0", "for_ms": 10000}', ControlRequest(id="3F2A91C0", for_ms=10_000)),
         (b'{"id": "3f2a91c0", "by": "page-1/Ann B."}', ControlRequest(id="3f2a91c0", by="page-1/ann_b_")),
         (b'{"id": "3f2a91c0", "device": "' + b"p" * 50 + b'"}', ControlRequest(id="3f2a91c0", device="p" * 20)),
-        (b'{"id": "3f2a91c0", "t": 1, "other": []}', ControlRequest(id="3f2a91c0", t=1)),
     ],
 )
 def test_a_request_for_control_is_within_limits(raw: bytes, request_: ControlRequest) -> None:
@@ -365,26 +321,17 @@ def test_a_command_has_at_most_64_kb() -> None:
     assert "65537 bytes" in refused(c.DRIVE, fits.replace(b"aa", b"aaa", 1))
 
 
-def test_messages_of_a_robot_may_be_larger() -> None:
-    files = json.dumps({"files": ["a" * 100] * 1000, "timestamp": 1.0}).encode()
-    assert len(files) > 64 * 1024
-    assert len(codec.decode(c.SOUNDBOARD_FILES, files).files) == 1000
-
-
 # -- what we say
 
 
 SIGNED = Drive(x=-0.25, z=0.625, source="autonomy", run=1_000_000, valid_ms=400)
 #: What is sent: absent fields are not written, and a name that is no UTF-8 is written with its codes.
 ENCODED: list[tuple[Channel, Any, bytes]] = [
-    (c.MQTT_VIDEO, True, b'{"value":true}'),
     (c.AUDIO, bytearray(b"PBAT"), b"PBAT"),
-    (c.ONLINE, Heartbeat(t=1710969600123), b'{"t":1710969600123}'),
     (c.ONLINE, Heartbeat(t=1, online=False), b'{"t":1,"online":false}'),
     (c.CHARGING_LEVEL, ChargingLevel(value=7.4), b'{"value":7.4,"unit":"v"}'),
     (c.DRIVE, Drive(z=0.5), b'{"x":0.0,"z":0.5,"y":0.0}'),
     (c.DRIVE, SIGNED, b'{"x":-0.25,"z":0.625,"y":0.0,"source":"autonomy","run":1000000,"valid_ms":400}'),
-    (c.SOUNDBOARD_COMMAND, SoundboardCommand(file="a"), b'{"action":null,"enabled":null,"file":"a"}'),
     (c.SOUNDBOARD_COMMAND, SoundboardCommand(repeat=2), b'{"action":null,"enabled":null,"file":null,"repeat":2}'),
     (c.OUTLET_COMMAND, OutletCommand(on=True), b'{"on":true}'),
 ]

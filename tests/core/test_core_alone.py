@@ -1,4 +1,4 @@
-"""The core alone: without extensions and without their packages it runs a robot, on both transports."""
+"""The core alone runs a robot: without our extensions and their packages, on both transports, with owners of motors."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import os
 import re
 import shutil
 import signal
-import subprocess
 import sys
 import time
 import tty
@@ -86,68 +85,174 @@ class Line:
 
 
 @contextmanager
-def robot(core: Path, kind: str, line: Line, broker: Broker, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+def robot(core: Path, kind: str, broker: Broker, folder: Path, **more: Any) -> Iterator[Operator]:
+    """Run a robot with ``more`` in its config, and yield an operator of it."""
+    bridge = {"enabled": True, "remote_mqtt": {"host": "127.0.0.1", "port": broker.port}}
     config = {
         "robot": {"id": "rover"},
         "transport": {"kind": kind},
         "local_mqtt": {"port": broker.port},
-        "services": {
-            "mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "127.0.0.1", "port": broker.port}},
-            "serial_mcu_bridge": {"enabled": True, "serial": {"port": line.port}},
-        },
+        **more,
+        "services": {"mqtt_bridge": bridge, **more.get("services", {})},
     }
     path = folder / "robot.json"
     path.write_text(json.dumps(config))
     environment = {"PYTHONPATH": str(core), "PATH": os.environ["PATH"], "XDG_RUNTIME_DIR": str(folder)}
     environment |= {"XDG_STATE_HOME": str(folder)}
+    operator = Operator(broker.port, BASE)
     with (folder / "log").open("wb") as log:
         command = [sys.executable, "-S", "-m", "pebble.cli", "up", str(path)]  # -S: without the packages of this venv
         process = Child(command, cwd=folder, env=environment, stdout=log, stderr=log)
         try:
-            yield process
+            yield operator
         finally:
             process.send_signal(signal.SIGTERM)
-            assert process.wait(20) == 0, (folder / "log").read_text()
+            code = process.wait(20)
+            operator.close()
+            assert code == 0, (folder / "log").read_text()
 
 
-@pytest.mark.parametrize("kind", ["mqtt", "zenoh"])
-def test_a_robot_is_started_driven_and_stopped_and_its_line_ends(core: Path, kind: str, tmp_path: Path) -> None:
-    broker, line = Broker(tmp_path), Line()
-    operator = Operator(broker.port, BASE)
+def driveable(operator: Operator) -> dict[str, str]:
+    value: dict[str, Any] = operator.newest("status").get("value", {})
+    found: dict[str, str] = value.get("driveable", {})
+    return found
 
-    def driveable() -> dict[str, str]:
-        value: dict[str, Any] = operator.newest("status").get("value", {})
-        found: dict[str, str] = value.get("driveable", {})
-        return found
 
-    def shows(data: bytes, state: str, why: str = "") -> bool:
-        line.send(data)
-        return driveable().get("state") == state and why in driveable().get("why", "")
+def test_a_robot_with_a_board_is_driven_and_stopped_and_its_line_ends(
+    core: Path, broker: Broker, tmp_path: Path
+) -> None:
+    line = Line()
+    board = {"enabled": True, "serial": {"port": line.port}}
+    with robot(core, "mqtt", broker, tmp_path, services={"serial_mcu_bridge": board}) as operator:
 
-    def driven(wanted: str) -> bool:
-        operator.send("incoming/drive-values", {"x": 0, "z": 0.5})
-        time.sleep(0.05)
-        return line.read()[-1:] == [wanted]
+        def shows(data: bytes, state: str, why: str = "") -> bool:
+            line.send(data)
+            return driveable(operator).get("state") == state and why in driveable(operator).get("why", "")
 
-    try:
-        with robot(core, kind, line, broker, tmp_path):
-            assert until(lambda: driveable().get("state") == "unknown", 20)
-            noise = b"\xff\x00\x80\n>>> \nM 0.000 0.000\nT a0=\n"
-            assert until(lambda: shows(noise, "unknown", "what its board sends is not understood"), 10, step=0.1)
-            assert until(lambda: shows(b"OK M\n", "yes"), 10, step=0.1)
-            assert until(lambda: driven("M 0.500 0.500"), 10)
-            begun = time.monotonic()
-            assert until(lambda: line.read()[-1] == "M 0.000 0.000", 5)
-            assert time.monotonic() - begun < 2
-            assert until(lambda: driven("M 0.500 0.500"), 10)
-            operator.send("incoming/estop", {"by": "ann"})
-            assert until(lambda: operator.newest("estop/serial").get("latched") is True, 5)
-            assert line.read()[-1] == "M 0.000 0.000"
-            count = len(line.lines)
-            assert not any(driven("M 0.500 0.500") for _ in range(10))
-            assert {*line.read()[count:]} <= {"M 0.000 0.000"}
-            line.end()
-            assert until(lambda: driveable().get("state") == "no", 10)
-    finally:
-        operator.close()
-        broker.stop()
+        def driven(wanted: str) -> bool:
+            operator.send("incoming/drive-values", {"x": 0, "z": 0.5})
+            time.sleep(0.05)
+            return line.read()[-1:] == [wanted]
+
+        assert until(lambda: driveable(operator).get("state") == "unknown", 20)
+        noise = b"\xff\x00\x80\n>>> \nM 0.000 0.000\nT a0=\n"
+        assert until(lambda: shows(noise, "unknown", "what its board sends is not understood"), 10, step=0.1)
+        assert until(lambda: shows(b"OK M\n", "yes"), 10, step=0.1)
+        assert until(lambda: driven("M 0.500 0.500"), 10)
+        begun = time.monotonic()
+        assert until(lambda: line.read()[-1] == "M 0.000 0.000", 5)
+        assert time.monotonic() - begun < 2
+        assert until(lambda: driven("M 0.500 0.500"), 10)
+        operator.send("incoming/estop", {"by": "ann"})
+        assert until(lambda: operator.newest("estop/serial").get("latched") is True, 5)
+        assert line.read()[-1] == "M 0.000 0.000"
+        count = len(line.lines)
+        assert not any(driven("M 0.500 0.500") for _ in range(10))
+        assert {*line.read()[count:]} <= {"M 0.000 0.000"}
+        line.end()
+        assert until(lambda: driveable(operator).get("state") == "no", 10)
+
+
+#: An extension of an owner: it has motors, refuses a command and sees the others.
+LEGS = """
+import sys
+from pathlib import Path
+
+from pebble.extension import Extension, Program, Stage
+from pebble.forwarding.observer import Observer
+from pebble.motors.motor_owner import MotorOwner
+from pebble.motors.state_file import StateFile
+from pebble.runtime.process import run
+
+MOVES, SEEN = Path(__file__).with_name("moves"), Path(__file__).with_name("seen")
+
+
+class Seen(Observer):
+    def __init__(self, _config, _clock):
+        SEEN.touch()
+
+    def passed(self, channel, by, payload):
+        self.write("passed", channel, payload)
+        raise ValueError("what it raises ends nothing")
+
+    def refused(self, drop, channel, by):
+        self.write(drop.value, channel, b"")
+
+    def write(self, what, channel, payload):
+        with SEEN.open("a") as file:
+            file.write(f"{what} {channel.metric} {payload.decode()}\\n")
+
+
+def step(_config):
+    return lambda _side, _subject, message: "it is night" if b"horn" in message.payload else ""
+
+
+class Legs(MotorOwner):
+    name = owner = "legs"
+
+    def start(self) -> None:
+        self.halt()
+        self.on_stop(self.halt)
+        super().start()
+        self.report(True)
+
+    def move(self, drive, valid_s):
+        self.write(f"{drive.x:g} {drive.z:g} {0 < valid_s <= 0.75}")
+
+    def halt(self):
+        self.write("halt")
+
+    def write(self, line):
+        with MOVES.open("a") as file:
+            file.write(line + "\\n")
+
+
+StateFile.close = lambda _file: Legs.write(None, "a file is closed")
+EXTENSION = Extension(
+    name="legs",
+    package="legs.py",
+    program=Program("legs", "legs", stage=Stage.DEVICE, preloaded=False),
+    motors={"legs": "legs"},
+    observer="legs:Seen",
+    step="legs:step",
+)
+
+if __name__ == "__main__":
+    sys.exit(run(Legs))
+"""
+
+
+def test_legs_of_an_owner_are_driven_stopped_and_reset(core: Path, broker: Broker, tmp_path: Path) -> None:
+    (tmp_path / "legs.py").write_text(LEGS)
+    moves, seen = tmp_path / "moves", tmp_path / "seen"
+    extensions: dict[str, Any] = {"legs.py": {"drives": True}, "absent": {}}
+    with robot(core, "zenoh", broker, tmp_path, extensions=extensions) as operator:
+
+        def moved() -> bool:
+            begun = len(moves.read_text())
+            operator.send("incoming/drive-values", {"x": 0.25, "z": 0.5})
+            return until(lambda: "0.25 0.5 True" in moves.read_text()[begun:], 1)
+
+        assert until(lambda: driveable(operator).get("state") == "yes", 20)
+        absent = operator.newest("status")["value"]["services"]["absent"]
+        assert (absent["state"], absent["last_exit"]) == ("failed", "not installed")
+        offer = operator.newest("capabilities")["value"]
+        assert (offer["drive"]["available"], offer["estop"]["owners"]) == (True, ["legs"])
+        for sound in ("horn", "bell"):
+            operator.send("incoming/soundboard-command", {"action": "play", "file": sound})
+        assert until(lambda: "bell" in seen.read_text(), 5)
+        assert "an extension refuses it soundboard-command \n" in seen.read_text()
+        assert '"horn"' not in seen.read_text()
+        assert moved()
+        assert until(lambda: moves.read_text().endswith("halt\n"), 3)  # no further command has come
+        assert moved()
+        operator.send("incoming/estop", {"by": "ann"})
+        assert until(lambda: operator.newest("estop/legs")["latched"], 5)
+        assert moves.read_text().endswith("halt\n")
+        assert not moved()
+        stopped = operator.newest("estop/legs")
+        operator.send("incoming/estop-reset", {"boot": stopped["boot"], "count": stopped["count"]})
+        assert until(lambda: not operator.newest("estop/legs")["latched"], 5)
+        assert until(moved, 5)
+    ended = "halt\na file is closed\na file is closed\n"  # a file may be slow
+    assert moves.read_text().endswith(ended)

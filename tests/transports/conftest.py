@@ -11,9 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.transports.memory_net import MemoryNet
-from tests.transports.mqtt_net import MqttNet, PahoNet
 from tests.transports.net import Net
+from tests.transports.plain_nets import MemoryNet, MqttNet, PahoNet
 from tests.transports.zenoh_net import ZenohNet
 
 NETS: dict[str, Callable[[Path], Net]] = {

@@ -16,7 +16,7 @@ _context = multiprocessing.get_context("forkserver")
 _context.set_forkserver_preload(
     [
         *("__main__", "tests.ext.media.frames.frames_peer", "tests.transports.peer", "pebble.extensions.lab.rig.hub"),
-        *("tests.transports.zenoh.zenoh_actor", "tests.kit.robot"),
+        "tests.kit.robot",
     ]
 )
 

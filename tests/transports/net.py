@@ -123,9 +123,18 @@ class ProcessPeer:
         recipe = base64.b64encode(pickle.dumps((kind, name, settings, will))).decode()
         self._process = Forked("tests.transports.peer", recipe)
         assert self._answer() is True, "the peer did not connect"
+        self.pid = self._process.pid
 
     def publish(self, topic: str, payload: bytes, *, qos: QoS = QoS.DELIVERED, retain: bool = False) -> bool:
         return bool(self._ask({"topic": topic, "payload": payload.hex(), "qos": int(qos), "retain": retain}))
+
+    def listen(self) -> None:
+        """Subscribe to everything."""
+        self._ask({"listen": True})
+
+    def heard(self) -> Any:
+        """Return how many messages it has received, and the text of the last one."""
+        return self._ask({"heard": True})
 
     def kill(self) -> None:
         self._process.kill()

@@ -1,16 +1,18 @@
-"""Bounds and exact counts, which every kind of transport inherits and the shared suite does not reach."""
+"""Bounds and ages, which every kind of transport inherits and the shared suite does not reach; how kinds are found."""
 
 from __future__ import annotations
 
 import threading
 import tracemalloc
+from importlib.metadata import EntryPoint, EntryPoints
 
 import pytest
 
-from pebble.transports import Message, QoS, base, own_retained
+from pebble.errors import TransportError
+from pebble.transports import GROUP, Message, QoS, State, base, create, own_retained
+from pebble.transports.ages import MessageAges
 from pebble.transports.base import Subscriptions
 from pebble.transports.bounds import BoundedQueue, BoundedTable
-from pebble.transports.counters import Counters
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from pebble.transports.topics import check_topic
 from pebble.transports.zenoh.keymap import key_to_topic, topic_to_key
@@ -91,10 +93,6 @@ class TestQueue:
         assert queue.append("larger", 1000) == ["c", "large"]
         assert queue.append("small", 1) == ["larger"]
         assert len(queue) == 1
-
-    def test_what_was_taken_or_cleared_takes_no_room(self) -> None:
-        queue: BoundedQueue[str] = BoundedQueue(10, 100)
-        queue.append("a", 100)
         queue.popleft()
         assert queue.append("b", 100) == []
         queue.clear()
@@ -111,17 +109,14 @@ class TestTable:
             table[topic] = b"1"
         assert dict(table) == {"a": b"1", "c": b"1"}
 
-    def test_topics_count(self) -> None:
-        table = self.made()
-        table["a" * 60] = b""
-        table["b" * 60] = b""
-        assert len(table) == 1
-
     def test_one_that_is_too_large_leaves_the_others(self) -> None:
         table = self.made()
         table["a"] = table["b"] = b"1"
         table["a"] = bytes(100)
         assert dict(table) == {"b": b"1"}
+        table["b" * 60] = b""
+        table["c" * 60] = b""
+        assert len(table) == 1, "topics count"
 
     def test_what_was_removed_makes_room(self) -> None:
         table = self.made()
@@ -134,29 +129,100 @@ class TestTable:
         assert table.put_if_room("c", bytes(99))
 
 
-def test_what_threads_count_while_others_look_is_exact() -> None:
-    counters, one = Counters(), 5000
-    add, ended = counters.adder("sent"), threading.Event()
+# -- the age of messages from other machines, whose clocks started some other time
 
-    def count() -> None:
-        for _ in range(one):
-            add()
-            counters.add("sent", 2)
 
-    def look() -> None:
-        seen = 0
-        while not ended.is_set():
-            found = counters["sent"]
-            assert found >= seen
-            seen = found
-            counters.snapshot()
+HERE, THERE, TOPIC = 1, 2, "a/b"
+LATE_S = 2.0
 
-    counting, looking = ([threading.Thread(target=act) for _ in range(4)] for act in (count, look))
-    for thread in counting + looking:
-        thread.start()
-    for thread in counting:
-        thread.join()
-    ended.set()
-    for thread in looking:
-        thread.join()
-    assert counters["sent"] == counters.snapshot()["sent"] == 4 * 3 * one
+
+class Receiver:
+    """Its clock shows ``now``; the operator's is ``offset`` behind, and counts ``rate`` seconds per second."""
+
+    def __init__(self, offset: float = 5000.0, rate: float = 1.0) -> None:
+        self.ages = MessageAges(HERE, LATE_S)
+        self._offset, self._rate = offset, rate
+
+    def receives(self, now: float, journey: float = 0.01) -> float:
+        return self.ages.age_s(THERE, TOPIC, (now - journey) * self._rate - self._offset, now)
+
+
+@pytest.mark.parametrize("offset", [5000.0, -5000.0])
+def test_what_piled_up_is_as_old_as_it_is(offset: float) -> None:
+    receiver = Receiver(offset)
+    assert [receiver.receives(now / 10) for now in range(10)] == pytest.approx([0.0] * 10, abs=0.01)
+    piled_up = [receiver.receives(7.0, journey=journey) for journey in (6.0, 4.0, 2.5, 1.0, 0.01)]
+    assert piled_up == pytest.approx([6.0, 4.0, 2.5, 1.0, 0.0], abs=0.02)
+
+
+@pytest.mark.parametrize("rate", [1.0005, 0.9995])
+def test_drifting_clocks_stay_comparable(rate: float) -> None:
+    receiver = Receiver(rate=rate)
+    assert max(receiver.receives(10.0 * turn) for turn in range(10_000)) < 0.1
+    assert receiver.receives(100_010.0, journey=5.0) == pytest.approx(5.0, abs=0.1)
+
+
+def test_standing_still_twice_is_no_reason_to_believe_old_messages() -> None:
+    receiver = Receiver()
+    receiver.receives(0.0)
+    for now in (10.0, 20.0, 30.0):
+        assert receiver.receives(now, journey=4.0) > LATE_S
+
+
+def test_a_clock_that_stood_still_is_believed_again_soon() -> None:
+    """A virtual machine was paused: all its messages seem late from then on, for ever."""
+    receiver = Receiver()
+    receiver.receives(0.0)
+    seemed = [receiver.receives(100.0 + turn / 10, journey=60.0) for turn in range(100)]
+    assert seemed[0] > LATE_S
+    assert seemed[-1] == pytest.approx(0.0, abs=0.01)
+
+
+def test_who_claims_to_be_another_machine_makes_nothing_of_it_late_on_other_topics() -> None:
+    receiver = Receiver()
+    for now in range(60):
+        receiver.ages.age_s(THERE, "a/mine", now - 5000.0 + 10.0, now)
+        assert receiver.receives(now) < LATE_S
+
+
+def test_many_machines_take_no_memory() -> None:
+    ages = MessageAges(HERE, LATE_S)
+    for boot in range(10, 1000):
+        ages.age_s(boot, TOPIC, 0.0, 0.0)
+    assert len(ages) <= 256
+
+
+# -- kinds
+
+
+class TheirTransport(MemoryTransport):
+    """A transport as a third party's package would define it."""
+
+
+def install(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
+    points = EntryPoints([EntryPoint(name="theirs", value=value, group=GROUP)])
+    monkeypatch.setattr("importlib.metadata.entry_points", points.select)
+
+
+def test_a_third_party_registers_through_an_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
+    install(monkeypatch, "tests.transports.test_base:TheirTransport")
+    with create("theirs", "client", MemoryHub()) as transport:
+        assert type(transport).__name__ == "TheirTransport"
+        assert transport.state is State.CONNECTED
+
+
+def test_an_unknown_kind_names_the_known_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    install(monkeypatch, "tests.transports.test_base:TheirTransport")
+    with pytest.raises(TransportError, match='no transport "carrier-pigeon": known are ') as refused:
+        create("carrier-pigeon", "client", None)
+    assert {"memory", "mqtt", "theirs", "zenoh"} <= set(str(refused.value).partition("known are ")[2].split(", "))
+
+
+def not_a_transport(client_id: str, settings: object, *, will: object) -> str:
+    return client_id
+
+
+def test_what_is_not_a_transport_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    install(monkeypatch, "tests.transports.test_base:not_a_transport")
+    with pytest.raises(TransportError, match="is not a pebble"):
+        create("theirs", "client", None)

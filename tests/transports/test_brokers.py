@@ -13,13 +13,11 @@ import pytest
 
 from pebble.extensions.operator.client.connection import Target, connected, subscribed_stop
 from pebble.extensions.operator.client.discovery import ALL_OUTGOING, Discovery
-from pebble.transports import Message, MqttSettings, QoS, State
+from pebble.transports import Message, MqttSettings, QoS
 from pebble.transports.mqtt.transport import MqttTransport
-from tests.forwarding.links.rig import MqttEnd, Rig, Side
 from tests.robot.operator import Operator
 from tests.robot.rig import BASE, STOP
 from tests.robot.rig import Rig as RobotRig
-from tests.services.mqtt_bridge.bridge_rig import Quiet
 from tests.sparing_broker import SparingBroker
 from tests.support import Broker, beside, until
 from tests.transports.brokers import MAKERS, ROBOT, Maker, sparing_aedes
@@ -27,7 +25,6 @@ from tests.transports.received import Received
 
 pytestmark = [pytest.mark.alone, pytest.mark.thorough]  # deadlines are checked; make long PART=brokers runs it
 
-FLAG = "incoming/flags/mqtt-audio"
 STOPPED = {"latched": True, "boot": "b", "count": 1, "recent": [], "by": "ann", "why": "", "since": 1}
 TRUE, FALSE = b'{"value": true}', b'{"value": false}'
 
@@ -64,59 +61,6 @@ def settings(broker: Broker, **more: Any) -> MqttSettings:
 @pytest.fixture
 def base(request: pytest.FixtureRequest) -> str:
     return f"pebble/robots/{request.node.originalname.rpartition('_')[2]}"
-
-
-def test_what_an_account_may_not_publish_costs_it_that_and_is_reported(
-    maker: Maker, broker: Broker, base: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    stream, state, command = (f"{base}/{one}" for one in ("outgoing/touch-sensors", "outgoing/forbidden", "incoming/x"))
-    more = {"as_published": True, "vital": (f"{base}/outgoing/online",), "reconnect_max_s": 0.2, **ROBOT}
-    robot = MqttTransport("robot", settings(broker, **more))
-    with robot, MqttTransport("operator", settings(broker)) as operator:
-        seen, commands, done = Received(), Received(), threading.Event()
-        operator.subscribe(f"{base}/outgoing/#", seen)
-        robot.subscribe(command, commands, echo=False)
-
-        def publish() -> None:
-            while not done.wait(0.02):
-                robot.publish(stream, b"1")
-                robot.publish(f"{base}/outgoing/imu", b"1")
-                robot.publish(f"{base}/outgoing/online", b"1", qos=QoS.DELIVERED, retain=True)
-
-        robot.publish(state, b"1", qos=QoS.DELIVERED, retain=True)
-        with beside(publish, done):
-            for topic in (stream, state) if maker.closes else ():
-                words = {"is not sent", topic}
-                assert until(lambda: any(all(word in one for word in words) for one in caplog.messages), 30)  # noqa: B023
-            assert until(lambda: robot.state is State.CONNECTED)
-            held = robot.counters["connected"]
-            before = len(seen.messages)
-            for number in range(50):
-                operator.publish(command, b"%d" % number, qos=QoS.DELIVERED)
-            assert until(lambda: commands.payloads[-50:] == [b"%d" % number for number in range(50)])
-            topics = {f"{base}/outgoing/imu", f"{base}/outgoing/online"}
-            assert until(lambda: {message.topic for message in seen.messages[before:]} == topics, 20)
-            assert robot.counters["connected"] == held
-        assert {one.topic for one in seen.messages} == {f"{base}/outgoing/imu", f"{base}/outgoing/online"}
-
-
-def test_an_operators_flag_is_not_overwritten_by_a_robot_that_starts(broker: Broker, tmp_path: Path) -> None:
-    own = MqttEnd(tmp_path)
-    rig = Rig("bridge", own, MqttEnd(tmp_path, broker=broker))
-    try:
-        rig.local.publish(FLAG, TRUE, retain=True)
-        rig.remote.publish(FLAG, FALSE, retain=True)
-        for client in (rig.local, rig.remote):
-            client.transport.close()
-        rig.start()
-        Quiet(rig.client(Side.LOCAL)).wait(0.5)
-        assert rig.retained(Side.LOCAL)[FLAG] == FALSE
-        operator = rig.client(Side.REMOTE)
-        operator.transport.ask([f"{rig.base}/{FLAG}"])
-        assert until(lambda: {*operator.payloads(FLAG)} == {FALSE}), operator.payloads(FLAG)
-    finally:
-        rig.close()
-        own.close()
 
 
 def test_an_operators_tool_finds_the_states_of_an_idle_robot(maker: Maker, broker: Broker, base: str) -> None:

@@ -1,29 +1,36 @@
-"""What a client writes and reads is what paho writes and reads."""
+"""What a client writes and reads is what paho writes and reads; what it does where no broker would show it; its id."""
 
 from __future__ import annotations
 
 import random
+import re
 import select
 import socket
 import struct
 import threading
+import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from itertools import product
 from typing import Any
 
 import pytest
-from paho.mqtt.client import Client
+from paho.mqtt.client import Client as PahoClient
 from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
+from pebble.transports import MqttSettings
 from pebble.transports.base import Message, QoS
+from pebble.transports.hosts import addresses_of
 from pebble.transports.mqtt import packets, reasons
-from pebble.transports.mqtt.client import SendQuota
+from pebble.transports.mqtt.client import Client, Opening, SendQuota
+from pebble.transports.mqtt.client_ids import unique
 from pebble.transports.mqtt.packets import ANY_QOS, MAX_PACKET, RETAIN, Accepted, Filter, MalformedError, Reader
 from tests.kit.mqtt_bytes import packet
+from tests.support import until
 
 NO_QUOTA = SendQuota(lambda _packet: None)
 V3, V5 = MQTTProtocolVersion.MQTTv311, MQTTProtocolVersion.MQTTv5
@@ -35,7 +42,7 @@ both_versions = pytest.mark.parametrize("modern", [False, True])
 class Paho:
     """A client of paho's, and the other end of its connection."""
 
-    def __init__(self, client: Client, keepalive_s: int = 60) -> None:
+    def __init__(self, client: PahoClient, keepalive_s: int = 60) -> None:
         self.client = client
         with socket.create_server(("127.0.0.1", 0)) as server:
             client.connect(*server.getsockname(), keepalive_s)
@@ -72,7 +79,7 @@ def pahos() -> Iterator[Pahos]:
     made: list[Paho] = []
 
     def make(*, modern: bool, **options: Any) -> Paho:
-        made.append(Paho(Client(CallbackAPIVersion.VERSION2, protocol=V5 if modern else V3, **options)))
+        made.append(Paho(PahoClient(CallbackAPIVersion.VERSION2, protocol=V5 if modern else V3, **options)))
         return made[-1]
 
     yield make
@@ -118,7 +125,7 @@ class TestWritten:
     @pytest.mark.parametrize("login", [(None, None), ("user", None), ("user", "pässword"), (None, "unused")])
     @pytest.mark.parametrize("will", [None, Message("a/ü", b"\xffgone", QoS.DELIVERED, True), Message("b", b"")])
     def test_connect(self, modern: bool, login: tuple[str | None, str | None], will: Message | None) -> None:
-        client = Client(CallbackAPIVersion.VERSION2, protocol=V5 if modern else V3, client_id="goob-1")
+        client = PahoClient(CallbackAPIVersion.VERSION2, protocol=V5 if modern else V3, client_id="goob-1")
         client.username_pw_set(*login)
         if will is not None:
             client.will_set(will.topic, will.payload, int(will.qos), will.retain)
@@ -130,7 +137,7 @@ class TestWritten:
         paho.other.close()
 
     def test_bridge_mode(self) -> None:
-        client = Client(CallbackAPIVersion.VERSION2, protocol=V3, client_id="b")
+        client = PahoClient(CallbackAPIVersion.VERSION2, protocol=V3, client_id="b")
         client.enable_bridge_mode()
         options: Any = {"will": None, "username": None, "password": None}
         paho = Paho(client)
@@ -141,18 +148,15 @@ class TestWritten:
     @pytest.mark.parametrize("qos", [0, 1])
     def test_publish(self, pahos: Pahos, modern: bool, qos: int) -> None:
         paho = pahos(modern=modern)
-        for retain, size in product((False, True), (0, 100, 127, 128, 20_000, 3_000_000)):
-            mid = paho.client.publish("a/ü", bytes(size), qos, retain).mid
-            ours = packets.publish("a/ü", bytes(size), qos, mid, retain=retain, modern=modern, expires_s=None)
-            assert ours == paho.written()
-
-    def test_publish_with_an_expiry(self, pahos: Pahos) -> None:
-        paho, properties = pahos(modern=True), Properties(PacketTypes.PUBLISH)
+        properties = Properties(PacketTypes.PUBLISH)
         properties.MessageExpiryInterval = 70_000
-        paho.client.publish("a", b"x", properties=properties)
-        assert packets.publish("a", b"x", 0, 0, retain=False, modern=True, expires_s=70_000) == paho.written()
+        for retain, size in product((False, True), (0, 127, 128, 20_000, 3_000_000)):
+            for given, expires_s in ((None, None), (properties, 70_000))[: 1 + modern]:
+                mid = paho.client.publish("a/ü", bytes(size), qos, retain, given).mid
+                ours = packets.publish("a/ü", bytes(size), qos, mid, retain=retain, modern=modern, expires_s=expires_s)
+                assert ours == paho.written()
 
-    def test_subscribe(self, pahos: Pahos) -> None:
+    def test_subscribe_and_disconnect(self, pahos: Pahos) -> None:
         paho, flags = pahos(modern=True), (False, True)
         for no_local, as_published, sends_retained in product(flags, flags, flags):
             handling = {True: SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE, False: SubscribeOptions.RETAIN_DO_NOT_SEND}[
@@ -162,23 +166,17 @@ class TestWritten:
             _, mid = paho.client.subscribe([("a/#", options), ("b", options)])
             wanted = [Filter(text, 1, no_local, as_published, sends_retained) for text in ("a/#", "b")]
             assert packets.subscribe(mid or 0, wanted, modern=True) == paho.written()
-
-    def test_subscribe_on_3_1_1(self, pahos: Pahos) -> None:
         paho = pahos(modern=False)
         paho.client.subscribe([("a/#", 1), ("b", 0)])
         assert packets.subscribe(1, [Filter("a/#", 1, True), Filter("b", 0)], modern=False) == paho.written()
+        paho.client.disconnect()
+        assert paho.written() == packets.DISCONNECT
 
     @both_versions
     def test_unsubscribe(self, pahos: Pahos, modern: bool) -> None:
         paho = pahos(modern=modern)
         paho.client.unsubscribe(["a/#", "b"])
         assert packets.unsubscribe(1, ["a/#", "b"], modern=modern) == paho.written()
-
-    def test_ping_and_disconnect(self, pahos: Pahos) -> None:
-        paho = pahos(modern=False)
-        paho.client.disconnect()
-        assert paho.written() == packets.DISCONNECT
-        assert packets.PINGREQ == b"\xc0\0"
 
     def test_a_text_that_is_too_long_is_refused(self) -> None:
         with pytest.raises(ValueError, match="65536 bytes where MQTT has room for 65535"):
@@ -216,24 +214,11 @@ class TestRead:
         assert len(reader.acks) == 4 * asked > 400
         assert reader.unread == reader.partial == 0
 
-    def test_a_topic_may_be_any_bytes(self) -> None:
-        assert read(packet(0x30, b"\0\2\xff\xfex"), modern=False)[0].seen == [(b"\xff\xfe", b"x", 0, False)]
-
     def test_no_more_than_asked_for(self) -> None:
         reader = Reader(noted := Noted(), NO_QUOTA, modern=False)
         reader.feed(5 * packet(0x30, b"\0\1ax"))
         assert [reader.read(2) for _ in range(4)] == [2, 2, 1, 0]
         assert len(noted.seen) == 5
-
-    def test_a_long_packet_in_small_pieces_is_copied_once(self) -> None:
-        long = packet(0x30, b"\0\1a" + bytes(MAX_PACKET - 3))
-        reader, copied = Reader(noted := Noted(), NO_QUOTA, modern=False), 0
-        for begin in range(0, len(long), 500):
-            reader.feed(long[begin : begin + 500])
-            copied += reader.unread
-            reader.read(64)
-        assert len(noted.seen) == 1
-        assert copied < 1.1 * len(long)
 
     @both_versions
     def test_each_other_packet(self, modern: bool) -> None:
@@ -302,7 +287,6 @@ class TestRead:
             (packet(0x30, b"\0\x09ax"), "ends in its head"),
             (packet(0x32, b"\0\1a\0"), "ends in its head"),
             (packet(0x36, b"\0\1a\0\1\0"), "QoS 3"),
-            (packet(0x10, b"MQTT"), "begins with 10"),
             (packet(0x40, b"\0"), "begins with 40 and has 1 bytes"),
             (b"\x30\xff\xff\xff\xff\1", "a length of more than four bytes"),
             (packet(0x90, bytes(MAX_PACKET + 1))[:14], "begins with 90"),
@@ -336,3 +320,115 @@ def test_reasons_are_called_as_paho_calls_them() -> None:
         name = ReasonCode(PacketTypes.DISCONNECT, identifier=0x80).names.get(code)
         if name is not None:
             assert reasons.words(code).lower() == next(iter(name)).lower()
+
+
+# -- against the other end of its socket
+
+
+RECEIVE_MAXIMUM_2 = packet(0x20, b"\0\0\3\x21\0\2")
+
+
+class Pair:
+    """A client, and the other end of its connection."""
+
+    def __init__(self) -> None:
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            settings = MqttSettings(host="127.0.0.1", port=server.getsockname()[1], protocol="5")
+            opening = Opening("client", settings, None, None, addresses_of(settings.host, settings.port)[0])
+            self.client = Client(opening, Noted(), bridge=False)
+            self.client.open()
+            self.other, _ = server.accept()
+        self.written()  # CONNECT
+
+    def written(self) -> bytes:
+        """What has arrived at the other end."""
+        select.select([self.other], [], [], 1)
+        self.other.setblocking(False)
+        parts = []
+        try:
+            while part := self.other.recv(1 << 20):
+                parts.append(part)
+        except BlockingIOError:
+            pass
+        return b"".join(parts)
+
+    def sends(self, data: bytes) -> None:
+        """The other end does, and the client reads it."""
+        self.other.setblocking(True)
+        self.other.sendall(data)
+        assert until(lambda: self.client.receive() == len(data))
+        self.client.read(64)
+
+    def close(self) -> None:
+        self.client.close()
+        self.other.close()
+
+
+@pytest.fixture
+def pair() -> Iterator[Pair]:
+    with closing(Pair()) as pair:
+        yield pair
+
+
+def publish(client: Client, number: int) -> None:
+    client.publish("a", b"%d" % number, 1, retain=False, expires_s=None)
+
+
+def test_no_more_is_in_flight_than_the_broker_takes(pair: Pair) -> None:
+    pair.sends(RECEIVE_MAXIMUM_2)
+    for number in range(5):
+        publish(pair.client, number)
+    client_sent = [
+        packets.publish("a", b"%d" % n, 1, n + 1, retain=False, modern=True, expires_s=None) for n in range(5)
+    ]
+    assert pair.written() == b"".join(client_sent[:2])
+    pair.sends(packet(0x40, b"\0\1"))
+    assert pair.written() == client_sent[2]
+    pair.sends(packet(0x40, b"\0\2") + packet(0x40, b"\0\3"))
+    assert pair.written() == b"".join(client_sent[3:])
+    pair.sends(packet(0x40, b"\0\4") + 5 * packet(0x40, b"\0\5"))  # more answers than were asked for allow no more
+    for number in range(3):
+        publish(pair.client, number)
+    assert len(pair.written()) == 2 * len(client_sent[0])
+
+
+def test_a_client_that_leaves_closes_after_the_other_side(pair: Pair) -> None:
+    """Else what that sends meanwhile has the connection reset, and a proxy may lose DISCONNECT with it."""
+    parts = list[bytes]()
+
+    def end() -> None:
+        while not b"".join(parts).endswith(packets.DISCONNECT):
+            parts.append(pair.other.recv(4096))
+        for _ in range(3):
+            pair.other.sendall(b"\xd0\0")
+            time.sleep(0.01)
+        parts.append(pair.other.recv(4096))  # a reset would raise
+        pair.other.close()
+
+    pair.other.setblocking(True)
+    other = threading.Thread(target=end)
+    other.start()
+    publish(pair.client, 1)
+    pair.client.disconnect()
+    assert pair.client.socket is None
+    other.join()
+    assert parts[-1] == b""
+
+
+@pytest.mark.parametrize(
+    ("name", "begins"),
+    [
+        ("pebble/robots/goob/remote_bridge", "pebble_robots_goob_remote_bridge-"),
+        ("a.b", "a_b-2e7336-"),
+        ("a_b", "a_b-"),
+        ("pebble/robots/größe", "pebble_robots_gr__e-9ce5d0-"),
+        ("\ud800", "_-"),
+        ("", "-"),
+    ],
+)
+def test_an_id_has_letters_digits_and_two_signs(name: str, begins: str) -> None:
+    first, second = unique(name), unique(name)
+    assert re.fullmatch(r"[A-Za-z0-9_-]*-[0-9a-f]{16}", first)
+    assert first.startswith(begins)
+    assert first[:-16] == second[:-16]
+    assert first != second

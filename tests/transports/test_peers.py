@@ -53,7 +53,6 @@ def test_a_socket_path_that_is_too_long_is_an_error_that_names_the_setting(tmp_p
 
 USERS: dict[str, Callable[[Path], object]] = {
     "peer": lambda folder: create("zenoh", "peer", ZenohSettings(run_dir=folder)).open(0.0),
-    "client": lambda folder: create("zenoh", "client", ZenohSettings(run_dir=folder, client=True)).open(0.0),
     "hub": lambda folder: ZenohHub(ZenohSettings(run_dir=folder)).open(),
     "reader": lambda folder: FrameReader(folder, "camera").open(),
     "writer": lambda folder: FrameWriter(folder, "camera", slots=2, capacity=100).open(),
@@ -85,34 +84,4 @@ def test_a_full_disk_keeps_no_process_from_being_there(tmp_path: Path, monkeypat
     lock.ready()
     assert registry.ready() == {lock.name: "?"}
     lock.release()
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_what_is_no_lock_file_is_no_process(tmp_path: Path) -> None:
-    (tmp_path / "folder.seat").mkdir()
-    os.mkfifo(tmp_path / "pipe.seat")
-    (tmp_path / "link.seat").symlink_to(tmp_path / "nowhere")
-    assert PeerRegistry(tmp_path).sockets() == []
-
-
-def test_a_lock_that_cannot_be_made_is_one_line_with_a_remedy(tmp_path: Path) -> None:
-    (tmp_path / "lock").mkdir()
-    with pytest.raises(TransportError, match="/lock cannot be locked: Is a directory; remove it, or set "):
-        FileLock.take(tmp_path / "lock")
-    with pytest.raises(TransportError, match="File name too long; make room there, or set "):
-        FileLock.take(tmp_path / ("x" * 300))
-
-
-def test_where_there_are_no_locks_the_reason_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fcntl.flock", refused(errno.ENOLCK))
-    for take in (FileLock.take, FileLock.wait):
-        with pytest.raises(TransportError, match="cannot be locked: No locks available; set "):
-            take(tmp_path / "lock")
-
-
-def test_a_presence_that_was_released_stays_so(tmp_path: Path) -> None:
-    presence = PeerRegistry(tmp_path).register("robot")
-    presence.release()
-    presence.ready()
-    presence.release()
     assert list(tmp_path.iterdir()) == []

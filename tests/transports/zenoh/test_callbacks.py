@@ -2,9 +2,8 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -46,7 +45,6 @@ with create("zenoh", "answering", ZenohSettings(run_dir=Path(sys.argv[1]))) as t
     sys.stdin.read()
 """
 ANSWERS, ANSWER_BYTES = 3000, 1000
-OTHERS = 8  # siblings that send meanwhile
 
 
 @contextmanager
@@ -85,23 +83,6 @@ def test_a_handler_may_wait_for_what_is_published(hub: HubProcess, requests: lis
                 assert transport.publish("request", request, qos=QoS.DELIVERED)
             assert until(lambda enough=number * ANSWERS: len(received) >= enough, 10), len(received)  # type: ignore[misc]
     assert len(received) == 3 * ANSWERS
-
-
-def test_the_handlers_of_many_connections_may_wait_at_once(hub: HubProcess) -> None:
-    """Each for the one before it, since a subscription's run one at a time."""
-    received: list[int] = []
-    with ExitStack() as stack:
-        asking, *others = [
-            stack.enter_context(create("zenoh", f"asking-{number}", hub.settings)) for number in range(1 + OTHERS)
-        ]
-        stack.enter_context(answering(hub))
-        asking.subscribe("answer", size_to(received), direct=True)
-        assert asking.publish("request", b"handler", qos=QoS.DELIVERED)
-        time.sleep(0.02)  # by then it waits
-        for other in others * 3:
-            assert other.publish("request", b"nothing", qos=QoS.DELIVERED)
-        assert until(lambda: len(received) >= ANSWERS, 10), len(received)
-    assert len(received) == ANSWERS
 
 
 def test_the_guard_rests_without_callbacks(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""Topics to Zenoh keys and back, against paho's matcher and Zenoh's own."""
+"""Filters and topics, and their Zenoh keys, against paho's matcher and Zenoh's own (T1)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ import pytest
 import zenoh
 from paho.mqtt.client import topic_matches_sub
 
+from pebble.transports.topics import matches
 from pebble.transports.zenoh.keymap import filter_to_key, key_to_topic, topic_to_key
+from tests.support import cases
 
 LEVELS = ["", "a", "b", "ab", "@", "@a", "$", "$a", "%", "%40", "*", "**", "a*", "?"]
 LEVELS += ["%25", "ä", "a b", "@retain", "$*"]
@@ -23,21 +25,22 @@ def random_topic(dice: random.Random) -> str:
     return "/".join(dice.choices([*LEVELS, "a", "a", "a"], k=dice.randint(1, 5))) or "a"
 
 
-def test_keys_match_where_paho_matches_topics() -> None:
+def test_filters_and_keys_match_where_paho_matches_topics() -> None:
     dice = random.Random(1)
     matched = 0
-    for _ in range(10_000):
+    for _ in range(cases(4_000, 20_000)):
         filter_, topic = random_filter(dice), random_topic(dice)
         wanted = topic_matches_sub(filter_, topic)
         matched += wanted
+        assert matches(filter_, topic) is wanted, (filter_, topic)
         have = zenoh.KeyExpr(filter_to_key(filter_)).intersects(zenoh.KeyExpr(topic_to_key(topic)))
         assert have == wanted, (filter_, topic)
-    assert matched > 150
+    assert matched > 60
 
 
 def test_every_topic_comes_back_and_no_two_share_a_key() -> None:
     dice = random.Random(2)
-    topics = {random_topic(dice) for _ in range(10_000)}
+    topics = {random_topic(dice) for _ in range(3_000)}
     keys = {topic_to_key(topic) for topic in topics}
     assert len(keys) == len(topics)
     assert {key_to_topic(key) for key in keys} == topics
@@ -45,7 +48,7 @@ def test_every_topic_comes_back_and_no_two_share_a_key() -> None:
 
 def test_keys_are_canonical_for_zenoh() -> None:
     dice = random.Random(3)
-    for _ in range(2000):
+    for _ in range(500):
         key = filter_to_key(random_filter(dice))
         assert str(zenoh.KeyExpr.autocanonize(key)) == key
 

@@ -1,4 +1,4 @@
-"""The scripted operator beside people at the operator page."""
+"""The scripted operator beside people at the operator page, and which robots people have."""
 
 from __future__ import annotations
 
@@ -7,8 +7,12 @@ from collections.abc import Iterator
 
 import pytest
 
-from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, CONTROL, CONTROL_TAKE
-from pebble.extensions.lab.demo.operator import TRAIL, Operator
+from pebble.contract import CONTROL, CONTROL_TAKE, DRIVE, codec
+from pebble.contract.payloads import Drive
+from pebble.extensions.lab.demo.operator import Operator
+from pebble.extensions.lab.demo.visitors import DRIVES_S, Visitors
+from pebble.extensions.operator.client.robot_view import RobotView
+from pebble.transports import Message
 from tests.kit.played_robot import RecordingRobot
 from tests.support import Broker, until
 
@@ -20,15 +24,7 @@ START_S = 5.0
 @pytest.fixture
 def robot(broker: Broker) -> Iterator[RecordingRobot]:
     with RecordingRobot(broker.port, BASE, keeps=True) as running:
-        running.publish_capabilities(running.motors.value | {"autonomy": {"available": True}})
-        running.publish(AUTONOMY_FILES.metric, {"files": [{"file": TRAIL}], "timestamp": 1}, retain=True)
         yield running
-
-
-def scripts(robot: RecordingRobot) -> list[str | None]:
-    """Return what it was asked to run; None: to end it."""
-    topic = AUTONOMY_COMMAND.topic(BASE)
-    return [payload.get("file") for _, name, payload in list(robot.received) if name == topic]
 
 
 @pytest.fixture
@@ -58,12 +54,32 @@ def test_a_robot_that_a_person_has_taken_is_left_alone_until_the_step_after(
     assert [one for one in operator.completed if one.ended > taken > one.began] == []
 
 
-def test_a_robot_with_scripts_draws_its_trail_from_the_first_drive_on(
-    robot: RecordingRobot, operator: Operator
-) -> None:
-    operator.begin("yours")
-    assert until(lambda: robot.drives(0.0))
-    assert until(lambda: scripts(robot) == [TRAIL])  # two subscriptions: one may be a moment later
-    robot.publish(AUTONOMY_STATUS.metric, {"running": True, "timestamp": 1, "file": TRAIL})
-    assert until(lambda: len(scripts(robot)) > 1, 30.0)
-    assert scripts(robot)[:2] == [TRAIL, None], "it is ended before the emergency stop, which would make it fail"
+# -- visitors
+
+
+GOOB, FRED = (RobotView(f"pebble/robots/{name}") for name in ("goob", "fred"))
+OURS, PASTED = codec.encode(DRIVE, Drive(z=0.6)), b'{"x": 0, "z": 0.3}'
+TOPIC = DRIVE.topic(GOOB.base)
+
+
+@pytest.mark.parametrize(
+    ("received", "taken"),
+    [
+        ([Message(TOPIC, OURS)], ""),
+        ([Message(TOPIC, PASTED)], "is driven by another program"),
+        ([Message(TOPIC, OURS), Message(TOPIC, OURS)], "is driven by another program"),  # one of them is not ours
+        ([Message(TOPIC, PASTED, retain=True)], ""),  # it moves nothing
+    ],
+    ids=["own", "pasted", "own and the same", "retained"],
+)
+def test_a_command_that_the_operator_has_not_sent_is_another_drivers(received: list[Message], taken: str) -> None:
+    visitors = Visitors("me")
+    visitors.note_sent(TOPIC, OURS)
+    for message in received:
+        visitors.receive_drive(message, 10.0)
+    assert [visitors.taken(robot, 11.0) for robot in (GOOB, FRED)] == [taken, ""]
+    assert visitors.taken(GOOB, 10.0 + DRIVES_S) == ""
+    assert [visitors.free(robot, 20.0) for robot in (GOOB, FRED)] == [taken == "", True]
+    assert visitors.left_alone == ({"goob"} if taken else set())
+    visitors.begin_step(20.0)
+    assert visitors.free(GOOB, 20.0)

@@ -1,6 +1,5 @@
 """The simulated MCU as a serial port, opened by a plain pyserial program."""
 
-import os
 import subprocess
 import sys
 import time
@@ -39,22 +38,6 @@ def test_a_host_talks_to_it_and_everything_is_traced_in_time(tmp_path: Path) -> 
     assert read_trace(tmp_path / "trace") == [*entries, mcu.trace.entries()[-1]]
 
 
-def test_the_line_is_raw_before_the_host_configures_it(tmp_path: Path) -> None:
-    """A terminal's echo would feed the MCU its own reports; its line editing would keep and alter bytes."""
-    with PtyMcu("goob", tmp_path / "port") as mcu:
-        host = os.open(mcu.symlink, os.O_RDWR | os.O_NOCTTY)
-        assert until(lambda: mcu.host)
-        os.write(host, b"\x03\x04\x7fM 1 1\r\n")
-        assert until(lambda: mcu.trace.lines() == ["\x03\x04\x7fM 1 1"])
-        read = b""
-        while read.count(b"\n") < 5:
-            read += os.read(host, 1000)
-        assert b"M 1 1" not in read
-        assert b"ERR unknown command\r\n" in read
-        os.close(host)
-        assert mcu.trace.lines() == ["\x03\x04\x7fM 1 1"]
-
-
 def test_a_host_that_does_not_read_loses_reports_and_stops_nothing(tmp_path: Path) -> None:
     with PtyMcu("goob", tmp_path / "port") as mcu, serial.Serial(str(mcu.symlink), 460800) as port:
         assert until(lambda: mcu.host)
@@ -90,13 +73,6 @@ def test_the_program(tmp_path: Path) -> None:
         assert program.wait(10) == 0
     assert [entry.line for entry in read_trace(trace) if entry.event == "line"] == ["M 1 1"]
     assert not symlink.is_symlink()
-
-
-def test_how_long_it_did_not_look_at_its_port_is_in_the_file(tmp_path: Path) -> None:
-    with PtyMcu("goob", tmp_path / "port", trace=tmp_path / "trace") as mcu:
-        with mcu._lock:
-            time.sleep(0.2)
-        assert until(lambda: max(entry.late_s for entry in read_trace(tmp_path / "trace")) >= 0.2)
 
 
 def test_it_never_takes_a_file_away(tmp_path: Path) -> None:

@@ -1,24 +1,30 @@
-"""A world whose time the test advances: repeatable to the last bit, faster than the real one."""
+"""A world whose time the test advances, repeatable to the last bit; scripts on its clock; bodies that walls stop."""
 
 from __future__ import annotations
 
 import hashlib
+import json
+import math
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from pebble.extensions.lab.simulation.world.lockstep import CameraMode, LockstepRobot, LockstepWorld
-from pebble.extensions.lab.simulation.world.world_file import World, parse_world
-from tests.ext.lab.simulation.world.worlds import CLEAR, projected, tags_in
+from pebble import Robot
+from pebble.extensions.lab.simulation.motion import FULL_SPEED_MM_S
+from pebble.extensions.lab.simulation.world.lockstep import LockstepRobot, LockstepWorld
+from pebble.extensions.lab.simulation.world.script_robot import SimulatedRobot
+from pebble.extensions.lab.simulation.world.world_file import parse_world
+from tests.ext.lab.simulation.world.worlds import tags_in, world_of
 
 pytestmark = pytest.mark.computing
 
-TAG = {"id": 13, "x": 3.0, "y": 0.0, "yaw_deg": 180.0}
-
-
-def world(**camera: float) -> World:
-    robots = {"goob": {"x": 0.0, "y": 0.0, "tag": 1}, "fred": {"kind": "fred", "x": 1.0, "y": 0.6, "tag": 2}}
-    return parse_world({"tags": [TAG], "robots": robots, "camera": camera})
+WORLD: dict[str, Any] = {
+    "tags": [{"id": 13, "x": 3.0, "y": 0.0, "yaw_deg": 180.0}],
+    "robots": {"goob": {"x": 0.0, "y": 0.0}, "fred": {"kind": "fred", "x": 1.0, "y": 0.6, "tag": 2}},
+    "camera": {"latency_ms": 70.0, "motion_blur_ms": 20.0},
+}
 
 
 def follow(goob: LockstepRobot) -> bytes | np.ndarray:
@@ -32,7 +38,7 @@ def follow(goob: LockstepRobot) -> bytes | np.ndarray:
 
 
 def history(seconds: float) -> str:
-    simulated, digest = LockstepWorld(world(latency_ms=70.0, motion_blur_ms=20.0)), hashlib.sha256()
+    simulated, digest = LockstepWorld(parse_world(WORLD)), hashlib.sha256()
     goob, fred = simulated.robots.values()
     fred.write(b"M 0.5 0.1\n")
     while simulated.now() < seconds:
@@ -43,33 +49,58 @@ def history(seconds: float) -> str:
 
 
 def test_two_runs_are_the_same_to_the_last_bit() -> None:
-    assert history(1.5) == history(1.5)
+    assert history(0.5) == history(0.5)
 
 
-def test_pictures_come_at_the_rate_of_the_camera_each_once() -> None:
-    simulated = LockstepWorld(world(), CameraMode(64, 48, 10.0))
-    goob = simulated.robots["goob"]
-    times = []
-    while simulated.now() < 1.0:
-        simulated.step()
-        times += [(simulated.now(), picture.at) for picture in (goob.picture(),) if picture is not None]
-    assert [at for _, at in times] == pytest.approx([(n + 1) / 10 for n in range(10)])
-    assert [now for now, _ in times] == pytest.approx([(n + 1) / 10 for n in range(10)], abs=0.006)
+def ahead(robot: Robot) -> None:
+    while robot.drive(z=0.5):
+        robot.sleep(0.1)
 
 
-def test_a_camera_with_latency_shows_what_was() -> None:
-    model = world(latency_ms=200.0, **CLEAR)
-    simulated = LockstepWorld(model)
-    goob = simulated.robots["goob"]
-    poses = {}
-    while simulated.now() < 1.0:
-        goob.drive(x=0.05, z=1.0)
-        simulated.step()
-        poses[round(simulated.now(), 3)] = goob.pose
-    picture = goob.picture()
-    assert picture is not None
-    assert picture.at == pytest.approx(0.8)
-    then = tuple(poses[0.8])
-    assert np.abs(tags_in(picture.pixels)[13] - projected(model, 13, then)).max() < 1.0  # type: ignore[arg-type]
-    now = tuple(poses[1.0])
-    assert np.abs(tags_in(picture.pixels)[13] - projected(model, 13, now)).max() > 2.0  # type: ignore[arg-type]
+def test_a_script_moves_its_robot_and_leaves_it_at_rest(tmp_path: Path) -> None:
+    (tmp_path / "world.json").write_text(json.dumps(WORLD))
+    robot = SimulatedRobot(tmp_path / "world.json")
+    robot.run(ahead, seconds=4.0)
+    assert robot.distance_to(tag=13) == pytest.approx(3.0 - 4.0 * 0.19, abs=0.03)
+    before = robot.body.pose
+    robot.world.run(1.0)
+    assert robot.body.pose.x == pytest.approx(before.x, abs=0.03)
+
+
+# -- robots have bodies
+
+
+WALL = {"x1": 1.0, "y1": 1.0, "x2": 1.0, "y2": -1.0}
+TOUCH_M = 0.9  # x of a robot of radius 0.1 at the wall
+
+
+def driven(seconds: float, left: float, right: float, world: LockstepWorld | None = None, **keys: Any) -> LockstepWorld:
+    """Drive goob's wheels."""
+    world = world or LockstepWorld(world_of(**keys))
+    end = world.now() + seconds
+    while world.now() < end:
+        world.robots["goob"].write(b"M %.3f %.3f\n" % (left, right))
+        world.run(0.1)
+    return world
+
+
+@pytest.mark.parametrize("heading_deg", [0.0, -40.0])
+def test_a_wall_stops_a_robot_where_its_body_touches(heading_deg: float) -> None:
+    world = driven(4.0, 1, 1, walls=[WALL], robots={"goob": {"x": 0.0, "y": 0.0, "heading_deg": heading_deg}})
+    goob = world.robots["goob"]
+    assert goob.pose.x == pytest.approx(TOUCH_M, abs=1e-4)
+    assert goob.pose.y == pytest.approx(TOUCH_M * math.tan(math.radians(heading_deg)), abs=1e-3), "it does not slide"
+    assert goob.pose.heading == pytest.approx(math.radians(heading_deg))
+    before = goob.motion.left_mm
+    driven(1.0, 1, 1, world)
+    assert goob.motion.left_mm - before == pytest.approx(FULL_SPEED_MM_S, rel=0.05), "the wheels slip and count on"
+    driven(1.0, -1, -1, world)
+    assert goob.pose.x < TOUCH_M - 0.2, "it drives away"
+
+
+def test_robots_stop_each_other_and_neither_is_pushed() -> None:
+    world = LockstepWorld(parse_world({"robots": {"goob": {"x": 0.0, "y": 0.0}, "fred": {"x": 1.0, "y": 0.0}}}))
+    fred = world.robots["fred"].pose
+    driven(4.0, 1, 1, world)
+    assert world.robots["fred"].pose == fred
+    assert world.robots["goob"].pose.x == pytest.approx(0.8, abs=1e-4)

@@ -1,7 +1,8 @@
-"""Poses in a file in memory: never torn, never waited for, and at most one writer."""
+"""Poses in a file in memory: never torn, never waited for, and at most one writer; and those between samples."""
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,8 +11,8 @@ import msgspec
 import pytest
 
 from pebble.errors import DeviceError
-from pebble.extensions.lab.simulation.world.pose_page import PosePage, PoseReader, page_path
-from pebble.extensions.lab.simulation.world.poses import RobotPose
+from pebble.extensions.lab.simulation.world.pose_page import PosePage, PoseReader
+from pebble.extensions.lab.simulation.world.poses import RobotPose, Sample, Track
 from tests.support import Child, until
 
 BUSY = """
@@ -82,8 +83,15 @@ def test_what_is_no_page_and_a_folder_that_others_may_write_are_refused(path: Pa
         PosePage(path, ["goob"])
 
 
-def test_the_page_of_a_file_is_the_same_by_every_name_of_the_file(tmp_path: Path) -> None:
-    (tmp_path / "world.json").touch()
-    (tmp_path / "link.json").symlink_to("world.json")
-    assert page_path(tmp_path / "link.json") == page_path(tmp_path / "world.json")
-    assert page_path(tmp_path / "other.json") != page_path(tmp_path / "world.json")
+TRACK = Track([Sample(100, RobotPose(0, 0, 3.0)), Sample(200, RobotPose(1, -2, -3.0)), Sample(300, RobotPose(1, 0, 0))])
+
+
+def test_a_pose_between_two_samples_is_interpolated_the_short_way_round() -> None:
+    x, y, heading = TRACK.at(150)
+    assert (x, y) == (0.5, -1.0)
+    assert math.remainder(heading - math.pi, math.tau) == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize(("ns", "pose"), [(0, (0, 0, 3.0)), (200, (1, -2, -3.0)), (999, (1, 0, 0))])
+def test_at_and_beyond_the_samples_a_pose_is_a_samples(ns: int, pose: tuple[float, float, float]) -> None:
+    assert tuple(TRACK.at(ns)) == pytest.approx(pose)

@@ -46,20 +46,17 @@ def test_all_mistakes_are_reported_at_once_with_their_places() -> None:
          "robots.fred: stands 0.10 m from goob, must be 0.2 m or more"),
         ({"robots": {"goob": GOOB | {"tag": 99}}},
          "robots.goob.tag: must be below 35, the number of tags in APRILTAG_25h9, not 99"),
-        ({"walls": [{"x1": 1, "y1": 1, "x2": 1, "y2": 1}]}, "walls[0]: begins where it ends"),
         ({"drawings": [{"x": 1, "y": 0, "z": 0.3, "width_m": 1, "height_m": 1, "shapes": []}]},
          "drawings[0]: needs shapes of three points or more, each x and y"),
         ({"walls": [{"x1": 0.05, "y1": 1, "x2": 0.05, "y2": -1}]},
          "robots.goob: stands 0.05 m from a wall, its radius is 0.1"),
         ({"room": {"x_min": 1, "x_max": 0, "y_min": 0, "y_max": 1}},
          "room.x_min: must be below x_max, which is 0, not 1"),
-        ({"room": {"x_min": 1, "x_max": 2, "y_min": 0, "y_max": 1}}, "robots.goob: stands outside the room, at 0, 0"),
     ],
 )  # fmt: skip
 def test_values_that_contradict_each_other_are_refused(keys: dict[str, Any], problem: str) -> None:
     assert problems(**keys) == [problem]
 
 
-@pytest.mark.parametrize("name", ["a/b", "", "x" * 65, "ü" * 40])
-def test_a_robots_name_must_fit_into_a_topic_and_the_page(name: str) -> None:
-    assert "the name must be a topic level" in problems(robots={name: GOOB})[0]
+def test_a_robots_name_must_fit_into_a_topic() -> None:
+    assert "the name must be a topic level" in problems(robots={"a/b": GOOB})[0]

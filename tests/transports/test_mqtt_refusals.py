@@ -1,17 +1,21 @@
-"""Brokers that hang up on a message cost its topic; links that are lost for other reasons cost none for long."""
+"""Brokers that hang up on a message cost its topic; and what a client makes of one that lacks something."""
 
 from __future__ import annotations
 
-import logging
 from collections import Counter
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
-from pebble.transports import Message
+from pebble.transports import Message, MqttSettings, QoS, State
+from pebble.transports.mqtt.bridge_mode import BridgeMode, Result
+from pebble.transports.mqtt.broker_limits import EVERYTHING, BrokerLimits, Limits
 from pebble.transports.mqtt.outgoing import InFlightTable
 from pebble.transports.mqtt.refused_topics import RefusedTopics
-from tests.support import further
+from pebble.transports.mqtt.transport import MqttTransport
+from tests.support import Broker, until
+from tests.transports.received import Received
 
 STEP_S = 0.02
 ROUND_TRIP_S = 0.04
@@ -104,10 +108,7 @@ def on(*topics: str) -> Refuses:
     return lambda topic, _size, _now: topic in topics
 
 
-@pytest.mark.parametrize(
-    "topics",
-    [("r/touch",), ("r/status",), further(("r/rare",)), ("r/touch", "r/status"), further(("r/imu", "r/charging"))],
-)
+@pytest.mark.parametrize("topics", [("r/rare",), ("r/touch", "r/status")])
 def test_what_a_broker_hangs_up_on_costs_that_topic(topics: tuple[str, ...]) -> None:
     link = Link(on(*topics)).run(300)
     assert set(link.topics.withheld) == set(topics) == set(link.topics.not_taken)
@@ -117,17 +118,7 @@ def test_what_a_broker_hangs_up_on_costs_that_topic(topics: tuple[str, ...]) -> 
     assert [topic for topic, share in rates.items() if topic not in topics and share < 0.9] == []
 
 
-def test_a_topic_that_is_allowed_again_is_used_again(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO)
-    link = Link(lambda topic, _size, now: topic == "r/touch" and now < 100).run(99)
-    assert set(link.topics.withheld) == {"r/touch"}
-    link.run(70)
-    assert not link.topics.withheld
-    assert "accepts messages on r/touch again" in caplog.messages[-1]
-    assert link.rates(10)["r/touch"] > 0.95
-
-
-@pytest.mark.parametrize("topic", ["r/online", "r/estop/wheels", "r/capabilities"])
+@pytest.mark.parametrize("topic", ["r/online", "r/estop/wheels"])
 def test_a_vital_topic_is_never_withheld_and_an_error_names_it(topic: str, caplog: pytest.LogCaptureFixture) -> None:
     link = Link(lambda name, _size, now: name == topic and now < 100).run(99)
     assert any("this account cannot run a robot" in line and topic in line for line in caplog.messages)
@@ -138,7 +129,7 @@ def test_a_vital_topic_is_never_withheld_and_an_error_names_it(topic: str, caplo
     assert min(link.rates(20).values()) > 0.9
 
 
-@pytest.mark.parametrize("topic", ["r/capabilities", "r/status", "r/imu"])
+@pytest.mark.parametrize("topic", ["r/capabilities", "r/imu"])
 def test_a_message_beyond_the_limit_of_a_broker_costs_only_messages_of_that_size(topic: str) -> None:
     link = Link(lambda _topic, size, _now: size > 10_000, **{topic[2:]: 24_000}).run(60)
     assert set(link.topics.withheld) == set(link.topics.not_taken) == {topic}
@@ -150,7 +141,7 @@ def test_a_message_beyond_the_limit_of_a_broker_costs_only_messages_of_that_size
     assert link.losses == losses
 
 
-@pytest.mark.parametrize("every_s", [0.1, 0.3, 1.0, further(3.0), 10.0])
+@pytest.mark.parametrize("every_s", [0.1, 1.0, 10.0])
 def test_a_link_that_is_lost_20_times_costs_topics_for_a_minute_at_most(every_s: float) -> None:
     link = Link(on(), every_s=every_s, losses=20).run(21 * (every_s + 0.12))
     assert link.losses == 20
@@ -180,3 +171,106 @@ def test_what_is_remembered_is_bounded() -> None:
     for _ in range(3):
         topics.note_loss("broker", in_flight.first_written(1.1), 1.1)
     assert len(topics.withheld) == 1000
+
+
+# -- brokers without retained messages, QoS 1, wills or bridge mode
+
+
+NONE = Limits(retain=False, qos=0)
+NO_RETAIN, NO_QOS, NO_WILL = Limits(retain=False), Limits(qos=0), Limits(will=False)
+RESULTS = {"accepts": Result.ACCEPTED, "hangs up": Result.HUNG_UP, "no retain": Result.RETAIN_REFUSED}
+RESULTS |= {"no QoS": Result.QOS_REFUSED, "refuses": Result.FAILED}
+
+
+@pytest.mark.parametrize(
+    ("events", "limits"),
+    [
+        (["hangs up"] * 20, EVERYTHING),  # a proxy whose broker is away: no probe is accepted
+        (["hangs up", "probed", "hangs up"], NO_QOS),
+        (["hangs up", "probed", *["hangs up"] * 2], NO_RETAIN),
+        (["hangs up", "probed", *["hangs up"] * 3], NONE),
+        (["hangs up", "probed", *["hangs up"] * 4], NO_WILL),
+        (["hangs up", "probed", *["hangs up"] * 5], EVERYTHING),  # the will was not the reason
+        (["hangs up", "probed", *["hangs up"] * 2, "refuses"], EVERYTHING),  # the broker has gone
+        (["hangs up", "probed", "hangs up", "accepts", *["hangs up"] * 9], NO_QOS),  # it is away
+        (["no retain"], NO_RETAIN),
+        (["no QoS", "no retain", "accepts"], NONE),
+        (["no retain", "accepts", "later"], EVERYTHING),  # it may have another config
+    ],
+)
+def test_what_is_tried_next(events: list[str], limits: Limits) -> None:
+    learning, now = BrokerLimits(), 0.0
+    for event in events:
+        learning.begin(now)
+        if event in RESULTS:
+            if learning.wants_probe:
+                learning.note_probe(Result.FAILED)
+            learning.note_connect(RESULTS[event], now)
+        elif event == "probed":
+            assert learning.wants_probe
+            learning.note_probe(Result.ACCEPTED)
+        else:
+            now += 1000.0
+    learning.begin(now)
+    assert learning.limits == limits
+
+
+@pytest.mark.parametrize(
+    ("lacking", "protocol", "lost"),
+    [("retain_available false", "3.1.1", "keeps no retained messages"), ("max_qos 0", "5", "has no QoS 1")],
+)
+def test_messages_pass_both_ways_and_one_warning_names_what_is_lost(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, lacking: str, protocol: str, lost: str
+) -> None:
+    broker = Broker(tmp_path, lacking)
+    settings = MqttSettings(host="127.0.0.1", port=broker.port, protocol=protocol, as_published=True)
+    will = Message("robot/online", b"gone", QoS.DELIVERED, retain=True)
+    robot = MqttTransport("robot", settings, will=will)
+    operator = MqttTransport("operator", MqttSettings(host="127.0.0.1", port=broker.port)).open()
+    try:
+        seen, commands = Received(), Received()
+        operator.subscribe("robot/#", seen)
+        robot.open().subscribe("commands/#", commands, echo=False)
+        robot.publish("robot/state", b"state", qos=QoS.DELIVERED, retain=True)
+        assert until(lambda: b"state" in seen.payloads)
+        assert until(lambda: robot.publish("robot/event", b"event", qos=QoS.DELIVERED) and b"event" in seen.payloads)
+        assert until(lambda: operator.publish("commands/stop", b"", urgent=True) and commands.payloads)
+        assert until(lambda: any(lost in line for line in caplog.messages))
+        warned = [line for line in caplog.messages if "that is changed" in line]
+        assert len(warned) == ("retain" in lost)
+        broker.stop()
+        assert until(lambda: robot.state is not State.CONNECTED)
+        broker.start()
+        assert until(lambda: robot.state is State.CONNECTED)
+        robot.close()
+        assert until(lambda: b"gone" in seen.payloads)
+    finally:
+        robot.close()
+        operator.close()
+        broker.stop()
+
+
+ACCEPTED, PROTOCOL, HUNG_UP, OTHER = Result.ACCEPTED, Result.PROTOCOL_REFUSED, Result.HUNG_UP, Result.FAILED
+
+
+@pytest.mark.parametrize(
+    ("results", "attempts"),
+    [
+        ([PROTOCOL, OTHER], "bridge plain bridge"),
+        ([OTHER] * 4, "bridge bridge bridge bridge bridge"),  # a wrong password, say
+        ([HUNG_UP] * 6, "bridge probe bridge probe bridge probe bridge"),  # a proxy whose broker is away
+        ([HUNG_UP, ACCEPTED, ACCEPTED], "bridge probe bridge bridge"),  # the broker was just starting
+        ([HUNG_UP, ACCEPTED, OTHER, HUNG_UP], "bridge probe bridge bridge probe"),
+        ([HUNG_UP, ACCEPTED, HUNG_UP, ACCEPTED, HUNG_UP], "bridge probe bridge plain bridge plain"),  # remembered
+        ([PROTOCOL, ACCEPTED, HUNG_UP], "bridge plain bridge plain"),  # it is tried again with each connection
+        ([PROTOCOL, ACCEPTED, ACCEPTED, HUNG_UP], "bridge plain bridge bridge probe"),  # another broker
+    ],
+)
+def test_attempts_with_bridge_mode(results: list[Result], attempts: str) -> None:
+    """Those that end with ``results``, and the one after them."""
+    mode = BridgeMode()
+    made = []
+    for result in results:
+        made.append(mode.next_attempt.value)
+        mode.note(result)
+    assert [*made, mode.next_attempt.value] == attempts.split()
