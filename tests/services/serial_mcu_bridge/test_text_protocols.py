@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Iterator
+from itertools import product
 from types import ModuleType
 from typing import Any
 
@@ -43,39 +44,25 @@ def info(text: str) -> list[Any]:
 
 REPORTS: dict[ModuleType, dict[bytes, list[Any]]] = {
     goob_base: {
-        b"T a0=512 a1=498 a2=7": [Touch(512, 498, 7)],
-        b"T a0=512 a1=498 a2=7\r": [Touch(512, 498, 7)],
-        b"T a0=-1 a1=4095 a2=0": [Touch(-1, 4095, 0)],
-        b"T t0=1 t1=2 t2=3 chg=1": [Touch(1, 2, 3), Charging(True)],
-        b"T t0=1 t1=2 t2=3 chg=0": [Touch(1, 2, 3), Charging(False)],
+        b"T a0=-1 a1=4095 a2=0\r": [Touch(-1, 4095, 0)],
         b"T t0=1 t1=2 t2=3 chg=-1 v=7.1": [Touch(1, 2, 3), Charging(None), Level(7.1)],
         b"T  chg=1   t2=3 t1=2 t0=1": [Touch(1, 2, 3), Charging(True)],
-        b"C chg=-1 v=7.412": [Charging(None), Level(7.412)],
-        b"C v=7.4": [Level(7.4)],
-        b"C chg=0": [Charging(False)],
+        b"C chg=0 v=7.412": [Charging(False), Level(7.412)],
         b"C chg=0 v=nan": [Charging(False)],
-        b"C chg=0 v=inf": [Charging(False)],
         b"C chg=x v=8.": [Level(8.0)],
         b"T a0=1 a1=2 chg=1": [Charging(True)],
         b"OK M": [DeviceLogLine(logging.DEBUG, "OK M")],
         b"WARN odd": [DeviceLogLine(logging.WARNING, "WARN odd")],
         b"ERR unknown": [DeviceLogLine(logging.ERROR, "ERR unknown")],
-        b"Starting setup...": info("Starting setup..."),
         b"Done!\r": info("Done!"),
-        b"OKAY": info("OKAY"),
         b"t a0=1 a1=2 a2=3": info("t a0=1 a1=2 a2=3"),
-        b"M 1.000 1.000": info("M 1.000 1.000"),
-        b"": [],
         b" \r": [],
     },
     imu_mpu6050: {
-        FAST: [Motion(17, 1234, MOTION)],
         FAST + b"\r": [Motion(17, 1234, MOTION)],
         SLOW: [Summary(18, 1300, SUMMARY)],
-        b"MPU6050 ready": info("MPU6050 ready"),
         b"IMU n=1": info("IMU n=1"),
         b"\x07x": info("\N{REPLACEMENT CHARACTER}x"),
-        b"": [],
         b" \r": [],
     },
 }
@@ -86,14 +73,13 @@ def without_a_number(line: bytes) -> Iterator[bytes]:
     kind, *tokens = line.split()
     for number, token in enumerate(tokens):
         key = token.split(b"=")[0]
-        for wrong in (b"", key, key + b"=", key + b"=nan", key + b"=inf", key + b"=1e5", key + b"=x", key + b"=1_0"):
+        for wrong in (b"", key, key + b"=nan", key + b"=1e5", key + b"=1_0"):
             yield b" ".join([kind, *tokens[:number], wrong, *tokens[number + 1 :]])
 
 
 NOT_UNDERSTOOD = {
-    goob_base: [b"T", b"C", b"T a0=1 a1=2 a2=three", b"T a0=1 a1=2 a2=3.5", b"T a0=1 t1=2 a2=3", b"T a0=1_0 a1=2 a2=3",
-                b"T a0=\xd9\xa1 a1=2 a2=3", b"T a0=99999999999999999999 a1=2 a2=3", b"T a0=1 a1=2 a2=3T",
-                b"C v=1e400", b"C v=" + b"9" * 400, b"C =1 v= chg"],
+    goob_base: [b"T", b"T a0=1 a1=2 a2=3.5", b"T a0=1 t1=2 a2=3", b"T a0=1_0 a1=2 a2=3", b"T a0=\xd9\xa1 a1=2 a2=3",
+                b"T a0=99999999999999999999 a1=2 a2=3", b"T a0=1 a1=2 a2=3T", b"C v=1e400", b"C v=" + b"9" * 400],
     imu_mpu6050: [*without_a_number(FAST), *without_a_number(SLOW)],
 }  # fmt: skip
 PROTOCOLS = pytest.mark.parametrize("protocol", REPORTS, ids=lambda protocol: protocol.__name__.rpartition(".")[2])
@@ -114,7 +100,7 @@ def test_a_report_without_a_usable_field_is_a_warning(protocol: ModuleType) -> N
     for line in NOT_UNDERSTOOD[protocol]:
         (report,) = parsed(protocol, line)
         assert isinstance(report, DeviceLogLine), line
-        assert (report.level, report.text[:1]) == (logging.WARNING, "n" if protocol is goob_base else line[:1].decode())
+        assert report.level == logging.WARNING
 
 
 #: Of each protocol what its board sends, and what else comes on a line: noise, echoes, other programs.
@@ -123,10 +109,8 @@ KNOWN = {
                 b"ERR speed", b"Done!"],
     imu_mpu6050: [b"I n=1 ms=2 ax=0 ay=0 az=1 gx=0 gy=0 gz=0 t=20 r=0 p=0"],
 }  # fmt: skip
-NOISE = [b"", b"\r", b" ", b"\0", b"\xff\xfe\x80", b"\x00\xf8\x00\xf8", b"~", b"M 0.000 0.000", b"L 0.000 0.000 0.000",
-         b"T", b"C", b"T a0=1", b"T a0=x a1=2 a2=3", b"C v=nan", b"C v=", b"TC v=7", b"OKAY", b"ok", b"Done", b"I n=1",
-         b">>> ", b"Traceback (most recent call last):", b"SyntaxError: invalid syntax", b"login:", b"garbage",
-         bytes(range(128, 256))]  # fmt: skip
+NOISE = [b"", b"\r", b"\0", b"\xff\xfe\x80", b"M 0.000 0.000", b"T", b"T a0=1", b"C v=nan", b"TC v=7", b"OKAY", b"ok",
+         b"Done", b"I n=1", b">>> ", b"login:", bytes(range(128, 256))]  # fmt: skip
 
 
 @PROTOCOLS
@@ -177,35 +161,26 @@ def test_any_line_can_be_parsed_and_reports_no_number_that_is_none(protocol: Mod
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
-        (goob_base.drive_line(0.25, -1.0), b"M 0.250 -1.000\n"),
-        (goob_base.drive_line(-0.0001, 0), b"M 0.000 0.000\n"),
+        (goob_base.drive_line(-0.0001, 0.25), b"M 0.000 0.250\n"),
         (goob_base.drive_line(7, -1e300), b"M 1.000 -1.000\n"),
         (goob_base.STOP, b"M 0.000 0.000\n"),
-        (goob_base.lights_line(1, 0.5, 0), b"L 1.000 0.500 0.000\n"),
         (goob_base.lights_line(-1, 2, 0.0004), b"L 0.000 1.000 0.000\n"),
-        (goob_base.flash_line(0, 0, 1, 2), b"F 0.000 0.000 1.000 2.000\n"),
-        (goob_base.flash_line(0, 0, 9, 0.001), b"F 0.000 0.000 1.000 0.050\n"),
+        (goob_base.flash_line(0, 0.5, 9, 2), b"F 0.000 0.500 1.000 2.000\n"),
+        (goob_base.flash_line(0, 0, 1, 0.001), b"F 0.000 0.000 1.000 0.050\n"),
         (goob_base.flash_line(0, 0, 1, 1e300), b"F 0.000 0.000 1.000 3600.000\n"),
-        (goob_base.mix(0.0, 1.0), (1.0, 1.0)),
-        (goob_base.mix(0.5, 0.0), (0.5, -0.5)),
         (goob_base.mix(0.5, 0.75), (1.0, 0.25)),
         (goob_base.mix(1.0, -1.0), (0.0, -1.0)),
-        (goob_base.mix(-1.0, -1.0), (-1.0, 0.0)),
-        (goob_base.mix(0.0, 0.0), (0.0, 0.0)),
     ],
 )
 def test_commands(line: object, expected: object) -> None:
     assert line == expected
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize(
     ("make", "count"),
     [(goob_base.mix, 2), (goob_base.drive_line, 2), (goob_base.lights_line, 3), (goob_base.flash_line, 4)],
 )
-def test_what_is_no_number_never_becomes_a_command(make: Callable[..., object], count: int, bad: float) -> None:
-    for place in range(count):
-        values = [0.0] * count
-        values[place] = bad
+def test_what_is_no_number_never_becomes_a_command(make: Callable[..., object], count: int) -> None:
+    for place, bad in product(range(count), (math.nan, math.inf, -math.inf)):
         with pytest.raises(PayloadError):
-            make(*values)
+            make(*(bad if at == place else 0.0 for at in range(count)))
