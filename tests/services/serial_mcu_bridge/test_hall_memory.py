@@ -14,8 +14,6 @@ import pytest
 
 from pebble.services.serial_mcu_bridge.text.hall_memory import HallMemory
 from tests.kit.hall_reader import HallReader
-from tests.services.serial_mcu_bridge.motor_rig import Bench
-from tests.support import until
 
 SLOTS = 64
 SECOND = 1_000_000_000
@@ -124,35 +122,3 @@ def test_what_is_not_its_own_stays_as_it_is(
         fill(memory, 3, second * SECOND)
     assert path.read_bytes() == before
     assert [record.message.partition(f"{path} ")[2][: len(text)] for record in caplog.records] == [text], "once"
-
-
-def is_whole(path: Path) -> bool:
-    """Programs of the original try again, too, while it is being made."""
-    try:
-        HallReader(path.name)
-    except (FileNotFoundError, ValueError):
-        return False
-    return True
-
-
-def test_a_bridge_keeps_every_line_of_its_board_whether_or_not_it_publishes_them(tmp_path: Path, path: Path) -> None:
-    bench = Bench(tmp_path, "goob", odometry_shm={"name": path.name})
-    try:
-        assert until(lambda: is_whole(path), 3)
-        reader = HallReader(path.name)
-        assert until(lambda: reader.newest >= 20)
-        samples = reader.read()
-        numbers = [sample.number for sample in samples]
-        assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
-        assert abs(samples[-1].at_ns - time.monotonic_ns()) < 5 * SECOND
-        assert bench.payloads("touch-sensors") == []
-    finally:
-        bench.close()
-
-
-def test_a_bridge_keeps_none_where_the_ring_is_off(tmp_path: Path, path: Path) -> None:
-    ring = {"name": path.name, "enabled": False}
-    bench = Bench(tmp_path, "goob", odometry_shm=ring, telemetry={"publish_touch_sensors": True})
-    assert until(lambda: bench.payloads("touch-sensors"), 5)
-    bench.close()
-    assert not path.exists()
