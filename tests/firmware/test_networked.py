@@ -15,8 +15,7 @@ from typing import Any
 import pytest
 
 from pebble.commands import app
-from pebble.errors import ConfigError, PebbleError
-from pebble.extensions.lab.simulation.fleet import members
+from pebble.errors import PebbleError
 from pebble.extensions.lab.simulation.trace import read_trace
 from tests.robot.operator import Operator
 from tests.support import ROOT, Broker, Child, until
@@ -108,24 +107,16 @@ def test_its_files_survive_a_killed_program_which_is_published_as_offline(
         assert became("estop/mcu", latched=True, count=0, recent=["00000000000000aa"])
 
 
-def test_kinds_of_a_fleet_take_turns_and_are_counted() -> None:
-    assert [(kind, identity.base) for kind, identity in members(3)] == [
-        ("minilamp", "pebble/robots/minilamp-001"),
-        ("benjr", "pebble/robots/benjr-001"),
-        ("minilamp", "pebble/robots/minilamp-002"),
-    ]
-    with pytest.raises(ConfigError, match="0"):
-        list(members(0))
-
-
-def test_a_fleet_shows_its_status_and_ends_in_order(start: Any, broker: Broker) -> None:
-    program = start("fleet", f"mqtt://127.0.0.1:{broker.port}", "-n", "3")
-    assert until(lambda: b"3 robots: connected" in program.out, 20), program.err
+def test_a_fleet_takes_turns_of_kinds_shows_its_status_and_ends_in_order(start: Any, broker: Broker) -> None:
+    with closing(Operator(broker.port, "pebble/robots")) as operator:
+        program = start("fleet", f"mqtt://127.0.0.1:{broker.port}", "-n", "3")
+        assert until(lambda: b"3 robots: connected" in program.out, 20), program.err
     program.process.send_signal(signal.SIGTERM)
     began = time.monotonic()
     assert program.process.wait(10) == 0
     assert time.monotonic() - began < 2.0
     assert "3 of 3 online" in program.err + program.out.decode()
+    assert {"minilamp-001", "benjr-001", "minilamp-002"} <= {one.topic.split("/")[2] for one in operator.seen}
     assert "Traceback" not in program.err
 
 

@@ -91,6 +91,7 @@ HISTORIES = (
     (((0, "hold", ANN), (9, "take", OTTO)), OTTO, (), True, True),
     (((0, "hold", ANN), (9, "release", ANN)), (), (), True, True),
     (((0, "hold", ANN), (9, "release", OTTO)), ANN, (), False, False),
+    (((0, "hold", ANN), (9, "hold", OTTO), (19, "release", OTTO)), ANN, (), True, False),
     (((0, "hold", ANN), (2999, "tick", ANN)), ANN, (), False, False),
     (((0, "hold", ANN), (3000, "tick", ANN)), (), (), True, True),
 )
