@@ -35,22 +35,20 @@ class Bench:
     def __init__(
         self,
         kind: str,
-        settings: dict[str, Any] | None = None,
         *,
         turn_ms: int = 1,
         change: Callable[[Machine], None] = lambda _machine: None,
         port: Port | None = None,
-        ticks_at_boot_ms: int = 0,
     ) -> None:
-        self.kind, self.settings, self.turn_ms = kind, settings or {}, turn_ms
+        self.kind, self.turn_ms = kind, turn_ms
         self.clock = VirtualClock()
         changed = _ChangedMachine(change)
-        self.board = Board(self.clock, changed, port=port, ticks_at_boot_ms=ticks_at_boot_ms)
+        self.board = Board(self.clock, changed, port=port)
         changed.board = self.board
         self.body: Any = body_of(kind, self.board)
         self.motors: list[tuple[float, tuple[float, float]]] = []
         self.body.on_motors = lambda now, motors: self.motors.append((now, motors))
-        self.robot: Any = self.board.load(kind, self.settings)
+        self.robot: Any = self.board.load(kind, {})
         self.turns = self.damaged = 0
         self._rest = b""
 

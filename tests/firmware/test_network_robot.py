@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable
-from itertools import permutations
-from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
 from tests.ext.lab.simulation.virtual_broker import Session, VirtualBroker
-from tests.firmware.drill import BASE, DRIVE, LIMIT_S, STALE_S, Drill
+from tests.firmware.drill import BASE, DRIVE, ESTOP, LIMIT_S, RESET, STALE_S, STATE, Drill
 from wifi import sockets
 
 KINDS = ("minilamp", "benjr")
@@ -41,35 +40,25 @@ def online(
     return drill
 
 
-GROUPS = {
-    b'{"drive-values":{"z":1.0,"valid_ms":400}}': True,
-    b'{"drive-values":{"z":1.0},"lights-solid":{"r":1}}': False,
-    b'{"lights-solid":{"r":1}}': False,
-    b'{"drive-values":{"z":1.0},"estop":{}}': False,
-}
-
-
-def test_groups_whose_topic_is_refused_are_not_announced() -> None:
-    (capabilities,) = published(online("minilamp", refused={f"{BASE}/incoming/group"}), "capabilities")
-    assert "groups" not in capabilities["value"]
-
-
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("group", GROUPS)
-def test_a_group_moves_a_board_that_lists_it_as_its_drive_command_would(kind: str, group: bytes) -> None:
+def test_a_group_moves_a_board_that_lists_it_as_its_drive_command_would(kind: str) -> None:
     drill = online(kind)
     (capabilities,) = published(drill, "capabilities")
     lists = capabilities["value"].get("groups") == ["drive-values"]
     assert lists is (kind == "minilamp"), "benjr has little room"
+    (capabilities,) = published(online(kind, refused={f"{BASE}/incoming/group"}), "capabilities")
+    assert "groups" not in capabilities["value"]
     drill.clock.watch = drill.check = lambda: None  # type: ignore[method-assign]
-    for moves in (lists and GROUPS[group], False):  # the second time it is stopped
-        drill.broker.publish(f"{BASE}/incoming/group", group, qos=1)
+    group = b'{"drive-values":{"z":1.0,"valid_ms":400}}'
+    for body, moves in ((group[:-1] + b',"estop":{}}', False), (group, lists), (group, False)):
+        drill.broker.publish(f"{BASE}/incoming/group", body, qos=1)
         drill.wait(0.2)
         assert any(drill.outputs()) is moves
         drill.wait(0.4)
         assert not any(drill.outputs()), "for as long as it is valid"
-        drill.stop()
-        drill.wait(0.3)
+        if moves is lists:
+            drill.stop()  # so that the last one does not move it
+            drill.wait(0.3)
 
 
 def published(drill: Drill, metric: str) -> list[Any]:
@@ -81,33 +70,21 @@ def test_its_capabilities_are_a_retained_message(kind: str) -> None:
     drill = online(kind)
     (message,) = [one.message for one in drill.broker.received if one.message.topic == f"{BASE}/outgoing/capabilities"]
     assert message.retain
-    value = json.loads(message.payload)["value"]
-    absent = {"available": False, "controls": False}
+    body = json.loads(message.payload)
+    value, absent = body["value"], {"available": False, "controls": False}
+    assert body["schema"] == "pebble-capabilities/v1"
+    assert value["identity"] == {"system": "pebble", "type": "robots", "id": "rover"}
     assert value["telemetry"]["charging_level_topic"] == f"{BASE}/outgoing/charging-level"
     assert value["telemetry"]["charging_status"] is (kind == "benjr")
-    assert (
-        value.items()
-        >= {
-            "identity": {"system": "pebble", "type": "robots", "id": "rover"},
-            "transport": {"kind": "mqtt"},
-            "drive": {"available": True, "controls": True, "arbitrates": True, "control": True, "topic": DRIVE}
-            | {"axes": ["x", "z", *(["y"] if kind == "minilamp" else [])]},
-            "estop": {
-                "available": True,
-                "topic": f"{BASE}/incoming/estop",
-                "reset_topic": f"{BASE}/incoming/estop-reset",
-                "owners": ["mcu"],
-                "status_topics": [f"{BASE}/outgoing/estop/mcu"],
-            },
-            **dict.fromkeys(("video", "audio", "soundboard", "autonomy"), absent),
-            "system": dict.fromkeys(("reboot", "service_restart", "git_pull"), absent),
-        }.items()
-    )
-    assert json.loads(message.payload)["schema"] == "pebble-capabilities/v1"
+    drive = {"available": True, "controls": True, "arbitrates": True, "control": True, "topic": DRIVE}
+    assert value["drive"] == drive | {"axes": ["x", "z", *(["y"] if kind == "minilamp" else [])]}
+    topics = {"topic": ESTOP, "reset_topic": RESET, "owners": ["mcu"], "status_topics": [STATE]}
+    assert value["estop"] == {"available": True, **topics}
+    assert [value[name] for name in ("video", "audio", "soundboard", "autonomy")] == [absent] * 4
+    assert value["system"] == dict.fromkeys(("reboot", "service_restart", "git_pull"), absent)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_its_client_id_is_its_own_and_as_long_as_any_broker_takes(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_its_client_id_is_its_own_and_as_long_as_any_broker_takes(monkeypatch: pytest.MonkeyPatch) -> None:
     """A client that knows it can disconnect the robot. It lasts until the next boot, to end an old connection."""
     ids: list[str] = []
     accept = VirtualBroker.taken_over
@@ -117,10 +94,10 @@ def test_its_client_id_is_its_own_and_as_long_as_any_broker_takes(kind: str, mon
         accept(broker, by)
 
     monkeypatch.setattr(VirtualBroker, "taken_over", taken_over)
-    drill = online(kind)
+    drill = online("benjr")
     drill.drop_robot()
     drill.wait(10)
-    online(kind, seed=2)
+    online("benjr", seed=2)
     assert len(ids) == 3
     assert ids[0] == ids[1] != ids[2]
     assert all(re.fullmatch("pebble-[0-9a-f]{16}", one) for one in ids)
@@ -140,33 +117,24 @@ def test_the_battery_every_five_seconds_and_not_retained(kind: str) -> None:
     assert published(drill, "charging-status") == ([{"value": False}] * len(levels) if kind == "benjr" else [])
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_reports_get_through_however_long_the_names_are(kind: str) -> None:
+def test_reports_get_through_however_long_the_names_are() -> None:
     identity = {"system": "s" * 64, "type": "t" * 64, "id": "\u540d" * 64}
-    drill = online(kind, robot=identity, ntp="")
+    drill = online("benjr", robot=identity, ntp="")
     drill.run(10)
     base = "/".join(identity.values())
     received = [one.message.topic for one in drill.broker.received]
     assert received.count(f"{base}/outgoing/capabilities") == 1
-    assert received.count(f"{base}/outgoing/charging-level") >= 1
-    assert received.count(f"{base}/outgoing/charging-status") == received.count(f"{base}/outgoing/charging-level") * (
-        kind == "benjr"
-    )
+    assert received.count(f"{base}/outgoing/charging-status") == received.count(f"{base}/outgoing/charging-level") >= 1
 
 
-@pytest.mark.parametrize("loss", ["broker", "wifi"])
-def test_it_reconnects_after_more_days_than_ticks_can_measure(loss: str) -> None:
+def test_it_reconnects_after_more_days_than_ticks_can_measure() -> None:
     drill = online("benjr")
     drill.wait(5)
-    lose, restore = {
-        "broker": (drill.broker.kill, drill.broker.start),
-        "wifi": (drill.network.radio.lose, drill.network.radio.restore),
-    }[loss]
-    lose()
+    drill.broker.kill()
     while drill.seconds < WEEK_S:
         drill.turn(30.0)
     drill.network.conditions.ntp = "silent"
-    restore()
+    drill.broker.start()
     drill.wait(15)
     assert drill.robot.session.connection.state == "online"
     assert abs(EPOCH_MS + drill.clock.now() * 1000 - published(drill, "online")[-1]["t"]) < 500
@@ -186,9 +154,8 @@ def test_a_backlog_does_not_drive_a_robot() -> None:
     assert not any(drill.outputs())
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_who_loses_the_broker_stops_at_once(kind: str) -> None:
-    drill = online(kind)
+def test_who_loses_the_broker_stops_at_once() -> None:
+    drill = online("minilamp")
     drill.command(0.0, 0.5)
     drill.wait(0.2)
     assert any(drill.outputs())
@@ -233,10 +200,10 @@ def test_a_certificate_needs_the_date() -> None:
     assert drill.board.rtc[0] == 2023
 
 
-@pytest.mark.parametrize("order", list(permutations(("10.0.0.1", "10.0.0.2", "10.0.0.9"))), ids=" ".join)
-def test_every_address_of_its_broker_has_a_turn_and_the_one_that_worked_comes_again(order: tuple[str, ...]) -> None:
+def test_every_address_of_its_broker_has_a_turn_and_the_one_that_worked_comes_again() -> None:
     drill = Drill("minilamp", 1)
-    drill.network.hosts = {"fleet.test": order, "pool.ntp.org": "10.0.0.3"}  # the broker is the second one
+    order = ("10.0.0.9", "10.0.0.1", "10.0.0.2")  # the broker has the second one by number
+    drill.network.hosts = {"fleet.test": order, "pool.ntp.org": "10.0.0.3"}
     settings = {"robot": {"id": "rover"}, "wifi": {"ssid": "home"}, "mqtt": {"host": "fleet.test"}}
     drill.robot = drill.board.load("minilamp", settings)
     drill.run(40)
@@ -248,36 +215,10 @@ def test_every_address_of_its_broker_has_a_turn_and_the_one_that_worked_comes_ag
     assert (drill.robot.session.connection.state, drill.robot.session.connection.losses) == ("online", losses + 1)
 
 
-class FakeSocket:
-    """Takes everything at once; ``reads``, ``datagrams`` and ``writes`` are what it returns, ``sent`` what it got."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, **returns: Any) -> None:
-        self.sent: list[bytes] = []
-        self.returns = returns
-        module = SimpleNamespace(socket=lambda *_: self, AF_INET=2, SOCK_DGRAM=2)
-        monkeypatch.setattr(sockets, "socket", module)
-        monkeypatch.setattr(sockets, "select", SimpleNamespace(poll=lambda: self, POLLOUT=4))
-
-    def setblocking(self, _on: bool) -> None: ...
-
-    connect = register = sendto = lambda *_: None
-
-    def readinto(self, _data: memoryview) -> Any:
-        return self.returns["reads"]
-
-    def recvfrom(self, _size: int) -> Any:
-        return self.returns["datagrams"]
-
-    def write(self, data: memoryview) -> int | None:
-        self.sent.append(bytes(data))
-        return None if len(self.sent) < 3 else len(data)
-
-
 @pytest.mark.parametrize(
     ("asked", "answers", "received"),
     [
         ("8.8.8.8", "8.8.8.8", b"answer"),
-        ("8.8.8.8", "6.6.6.6", b""),
         ("85.1.2.3", "8.8.8.8", b""),
         ("224.0.0.251", "192.168.1.7", b"answer"),
     ],
@@ -285,13 +226,16 @@ class FakeSocket:
 def test_only_who_was_asked_may_answer(
     monkeypatch: pytest.MonkeyPatch, asked: str, answers: str, received: bytes
 ) -> None:
-    FakeSocket(monkeypatch, datagrams=(b"answer", (answers, 53)))
+    module = Mock(**{"socket.return_value.recvfrom.return_value": (b"answer", (answers, 53))})
+    monkeypatch.setattr(sockets, "socket", module)
     assert sockets.Query(asked, 53, b"question", 0).step(0) == received
 
 
 def test_what_tls_could_not_send_comes_again_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
-    socket = FakeSocket(monkeypatch)
+    write = Mock(side_effect=(None, None, 9, 9))
+    monkeypatch.setattr(sockets, "socket", Mock(**{"socket.return_value.write": write}))
+    monkeypatch.setattr(sockets, "select", Mock())
     stream, data = sockets.Stream("10.0.0.2", 1883, None), memoryview(b"heartbeat and more")
     assert [stream.write(data, count) for count in (9, 18, 18)] == [0, 0, 9]  # more waits by now
     assert stream.write(data[9:], 9) == 9
-    assert socket.sent == [b"heartbeat"] * 3 + [b" and more"]
+    assert [bytes(call.args[0]) for call in write.call_args_list] == [b"heartbeat"] * 3 + [b" and more"]

@@ -148,42 +148,29 @@ class M:
         return replace(self, **changes)
 
 
-def imu_interfaces(first: int = 1, *, channels: tuple[str, str] = ("sensors/imu-fast", "sensors/imu")) -> tuple[I, I]:
-    """Return the interfaces of the original Pebble's inertial sensor."""
-    fast = (
-        *(F(name, I16, 0.001, 0.0, "mps2") for name in ("ax", "ay", "az")),
-        *(F(name, I16, 0.01, 0.0, "dps") for name in ("gx", "gy", "gz")),
-        *(F(name, I16, 0.01) for name in ("temp_c", "roll_deg", "pitch_deg")),
+_MOTION = (
+    *(F(name, I16, 0.001, 0.0, "mps2") for name in ("ax", "ay", "az")),
+    *(F(name, I16, 0.01, 0.0, "dps") for name in ("gx", "gy", "gz")),
+    *(F(name, I16, 0.01) for name in ("temp_c", "roll_deg", "pitch_deg")),
+)
+_SUMMARY = (
+    F("accel_norm_g", U16, 0.001),
+    *(F(f"gyro_bias_{axis}_dps", I16, 0.01) for axis in "xyz"),
+    *(F("samples_ok", U32), F("samples_error", U32), F("calibration_samples", U16)),
+)
+_SWITCH = (F("on", BOOL),)
+_REPORT = (F("bound", BOOL), F("reachable", BOOL), F("on", BOOL))
+#: The original Pebble's inertial sensor, and its station of four switched sockets.
+IMU = M("goob-imu-nano", (
+    I(1, "imu_fast", OUT, KIND_SAMPLE, _MOTION, "sensors/imu-fast", "imu.motion.v1", LOCAL_ONLY, 100),
+    I(2, "imu", OUT, KIND_STATE, _SUMMARY, "sensors/imu", "imu.summary.v1", 0, 5),
+), "goob-imu-v2", "2", "arduino-nano")  # fmt: skip
+STATION = M("hs105-sta", tuple(
+    interface for n in range(1, 5) for interface in (
+        I(2 * n - 1, f"o{n}_set", IN, KIND_COMMAND, _SWITCH, f"outlets/o{n}/power", "outlet.switch.v1"),
+        I(2 * n, f"o{n}_state", OUT, KIND_STATE, _REPORT, f"outlets/o{n}/status", "outlet.switch.v1", RETAIN),
     )
-    slow = (
-        F("accel_norm_g", U16, 0.001),
-        *(F(f"gyro_bias_{axis}_dps", I16, 0.01) for axis in "xyz"),
-        F("samples_ok", U32),
-        F("samples_error", U32),
-        F("calibration_samples", U16),
-    )
-    return (
-        I(first, "imu_fast", OUT, KIND_SAMPLE, fast, channels[0], "imu.motion.v1", LOCAL_ONLY, 100),
-        I(first + 1, "imu", OUT, KIND_STATE, slow, channels[1], "imu.summary.v1", 0, 5),
-    )
-
-
-def outlets(count: int = 4) -> tuple[I, ...]:
-    """Return the interfaces of the original Pebble's station of switched sockets, which has four."""
-    switch = (F("on", BOOL),)
-    report = (F("bound", BOOL), F("reachable", BOOL), F("on", BOOL))
-    return tuple(
-        interface
-        for n in range(1, count + 1)
-        for interface in (
-            I(2 * n - 1, f"o{n}_set", IN, KIND_COMMAND, switch, f"outlets/o{n}/power", "outlet.switch.v1"),
-            I(2 * n, f"o{n}_state", OUT, KIND_STATE, report, f"outlets/o{n}/status", "outlet.switch.v1", RETAIN),
-        )
-    )
-
-
-IMU = M("goob-imu-nano", imu_interfaces(), "goob-imu-v2", "2", "arduino-nano")
-STATION = M("hs105-sta", outlets(), "hs105-sta-v1", "1", "seeed_xiao_esp32c3_hs105_station_bridge")
+), "hs105-sta-v1", "1", "seeed_xiao_esp32c3_hs105_station_bridge")  # fmt: skip
 #: One interface of each kind, the first two with an alias.
 LAMP = M("lamp-1", (
     I(1, "lamp", IN, KIND_COMMAND, (F("level", U8, 0.5, 0.0, "%"), F("on", BOOL)), "lights/lamp"),

@@ -1,6 +1,10 @@
-"""Claims of channels by self-describing devices, and peers: without a serial line and without a clock."""
+"""Claims of channels by self-describing devices, peers, and what is local_only, without a serial line."""
 
 from __future__ import annotations
+
+import json
+import re
+from typing import Any
 
 import msgspec
 import pytest
@@ -15,11 +19,13 @@ from pebble.services.serial_mcu_bridge.devices.aliases import claims
 from pebble.services.serial_mcu_bridge.devices.peers import CONFIRM_S, PeerDevices
 from pebble.services.serial_mcu_bridge.devices.private_topics import LocalOnly
 from pebble.services.serial_mcu_bridge.imu.reports import ImuWatchdog
+from pebble.services.serial_mcu_bridge.pebble_serial_v1 import frame, manifest
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import parse_describe
 from pebble.transports import Message
 from tests.ext.boards import mcu_wire as wire
 from tests.ext.boards.mcu_wire import IMU, STATION, F, I, M
-from tests.support import cases
+from tests.kit.robot import BASE
+from tests.support import ROOT, cases
 
 # -- claims
 
@@ -58,14 +64,12 @@ def test_which_channels_a_device_gets() -> None:
 
 
 COMMANDS = [
-    "drive-values", "lights-solid", "front-camera", "audio", "audio-stream", "soundboard-command", "autonomy-command",
-    "flags/reboot", "flags/mqtt-video", "flags/anything", "flags", "mip-raw", "mcu/other/led", "mcu",
-    "estop", "estop-reset", "estop/mcu", "estop-anything", "by", "by/anna/drive-values", "control",
+    "drive-values", "soundboard-command", "flags/anything", "flags", "mcu/other/led", "mcu", "estop", "estop-reset",
+    "estop/mcu", "estop-anything", "by/anna/drive-values", "control",
 ]  # fmt: skip
 PUBLISHED = [
-    "online", "heartbeat", "capabilities", "status", "logs", "charging-status", "charging-level", "touch-sensors",
-    "front-camera", "audio", "wheel-odometry", "flags/mqtt-video", "mcu/other/describe", "bridge-probe",
-    "estop", "estop/mcu", "estop/mcu/more", "estop-reset", "by/anna", "control", "control/lease",
+    "online", "heartbeat", "status", "front-camera", "wheel-odometry", "flags/mqtt-video", "mcu/other/describe",
+    "bridge-probe", "estop/mcu", "estop/mcu/more", "by/anna", "control/lease",
 ]  # fmt: skip
 
 
@@ -73,9 +77,8 @@ def test_which_channels_are_refused_with_which_reason() -> None:
     reasons = [refused(command("a", one)) for one in COMMANDS] + [refused(state("a", one)) for one in PUBLISHED]
     renamed = claims(published(M("u", (command("a", "elsewhere"),))), {"incoming/elsewhere": DRIVE}.get)
     assert [reason for reason in (*reasons, renamed.refused["a"]) if "robot's own" not in reason] == []
-    for channel in ("sensors/imu", "sensors/imu-fast"):
-        for profile in ("", "imu.motion.v1", "imu.summary.v1"):
-            assert "it needs the profile imu." in refused(state("a", channel, profile=profile))
+    for profile in ("", "imu.motion.v1"):
+        assert "it needs the profile imu." in refused(state("a", "sensors/imu", profile=profile))
 
 
 def test_a_local_only_interface_gets_no_public_channel_without_a_device_uid() -> None:
@@ -102,7 +105,7 @@ _ODD_INTERFACE = st.fixed_dictionaries({}, optional={
 })  # fmt: skip
 
 
-@settings(max_examples=cases(100, 1000))
+@settings(max_examples=cases(40, 1000))
 @given(st.lists(_ODD_INTERFACE, max_size=4))
 @example([{"channel": "sensors/imu", "profile": "imu.summary.v1", "encoding": {"fields": 5}}])
 def test_no_manifest_of_another_device_raises_anything(interfaces: list[dict[str, object]]) -> None:
@@ -141,17 +144,13 @@ def test_a_peer_device_claims_until_it_is_withdrawn_or_a_retained_manifest_is_no
 
 
 @pytest.mark.parametrize(
-    ("section", "instance", "expected"),
-    [
-        ({"protocol": "imu_mpu6050_v1"}, "", 5.0),
-        ({"protocol": "pebble_serial_v1"}, "imu", 5.0),
-        ({"protocol": "pebble_serial_v1"}, "outlets", 0.0),
-    ],
+    ("protocol", "instance", "expected"),
+    [("imu_mpu6050_v1", "", 5.0), ("pebble_serial_v1", "imu", 5.0), ("pebble_serial_v1", "outlets", 0.0)],
 )
-def test_which_lines_have_a_timeout(section: dict[str, object], instance: str, expected: float) -> None:
+def test_which_lines_have_a_timeout(protocol: str, instance: str, expected: float) -> None:
     """The first sample may take longer."""
     ours()  # which protocols there are
-    watchdog = ImuWatchdog(SerialBridge(**section), instance)  # type: ignore[arg-type]
+    watchdog = ImuWatchdog(SerialBridge(protocol=protocol), instance)
     assert watchdog.timeout_s == expected
     watchdog.begin(100.0)
     assert [watchdog.expired(at) for at in (106.9, 107.1)] == [False, expected > 0]
@@ -159,3 +158,145 @@ def test_which_lines_have_a_timeout(section: dict[str, object], instance: str, e
     assert [watchdog.expired(at) for at in (112.9, 113.1)] == [False, expected > 0]
     watchdog.end()
     assert not watchdog.expired(1000.0)
+
+
+OUT = f"{BASE}/outgoing"
+PRIVATE = ("mcu/spy-1/fast", "lab/fast", "mcu/spy-1/secret", "lab/secret", "mcu/spy-1/imu_fast", "lab/imu-fast")
+
+
+DESCRIBE, LIST = "mcu/spy-1/describe", "mcu/spy-1/local-only"
+LISTED = tuple(f"outgoing/{metric}" for metric in PRIVATE)
+TUNED = ("incoming/mcu/spy-1/tune", "incoming/lab/tune")
+
+
+def local_only(*topics: str, uid: str = "spy-1") -> Message:
+    payload = json.dumps({"topics": topics}).encode()
+    return Message(f"{OUT}/mcu/{uid}/local-only", payload, retain_requested=True)
+
+
+def sample(interface: str, uid: str = "spy-1") -> bytes:
+    body = {"t": 1, "seq": 1, "mcu_ms": 1, "device_uid": uid, "interface": interface, "profile": "", "value": {"v": 1}}
+    return json.dumps(body).encode()
+
+
+def value(metric: str, interface: str = "", **more: Any) -> Message:
+    """A value of the interface that the topic ends with, unless another is named."""
+    return Message(f"{OUT}/{metric}", sample(interface or metric.rpartition("/")[2]), **more)
+
+
+def cleared(metric: str) -> Message:
+    return Message(f"{OUT}/{metric}", b"", retain_requested=True)
+
+
+FAST, SLOW = ("mcu/spy-1/fast", "lab/fast"), ("mcu/spy-1/slow", "lab/slow")
+SECRET = value("mcu/spy-1/secret", retain_requested=True)
+KNOWN = local_only(*LISTED)
+NONSENSE = (b"", b"{", b'{"device_uid": 5}', b'["device_uid"]', b"\xff\xfe", sample("slow"))
+#: What is offered one after the other, and what passes then: the message, nothing, or the topics that are named.
+HISTORIES: dict[str, list[tuple[Message, bool | list[str]]]] = {
+    "what is listed stays, and what is not passes": [
+        (KNOWN, False),
+        *((value(metric), False) for metric in PRIVATE),
+        *((value(metric), True) for metric in SLOW),
+    ],
+    "before the list nothing of the MCU passes but its manifest": [
+        *((value(metric), False) for metric in (*FAST, *SLOW)),
+        (value("anywhere/else", "fast"), False),
+        (Message(f"{OUT}/{DESCRIBE}", b"{}", retain_requested=True), True),
+        (KNOWN, False),
+        *((value(metric), False) for metric in FAST),
+        *((value(metric), True) for metric in SLOW),
+    ],
+    # Retained messages arrive in any order, and later subscribers need the state of a socket.
+    **{
+        f"a value with {flag} waits for the list": [
+            *((value(metric, **{flag: True}), False) for metric in (*SLOW, "lab/secret")),
+            (KNOWN, [*SLOW]),
+            (KNOWN, False),
+        ]
+        for flag in ("retain", "retain_requested")
+    },
+    "a retained value that was cleared is not forwarded later": [
+        *(step for one in SLOW for step in ((value(one, retain=True), False), (cleared(one), True))),
+        (KNOWN, False),
+    ],
+    "a board that restarts: nothing passes until it is described again, and its states are cleared": [
+        (KNOWN, False),
+        (cleared(LIST), False),
+        (cleared("mcu/spy-1/slow"), True),
+        (cleared("mcu/spy-1/secret"), False),
+        *((value(metric), False) for metric in (*FAST, *SLOW)),
+        (KNOWN, False),
+        *((value(metric), True) for metric in SLOW),
+    ],
+    "a manifest that changes makes public what was private, and the other way round": [
+        *((KNOWN, False), (SECRET, False), (value("lab/slow"), True)),
+        *((local_only("outgoing/lab/slow"), False), (SECRET, True), (value("lab/slow"), False)),
+    ],
+    "two boards with one alias: the list of each counts, and neither speaks for the other": [
+        (local_only(), False),
+        (value("lab/slow", retain=True), True),
+        (Message(f"{OUT}/lab/slow", sample("slow", "spy-2"), retain=True), False),
+        (local_only("outgoing/lab/slow", uid="spy-2"), False),
+        (value("lab/slow"), False),
+        (value("mcu/spy-1/slow"), True),
+    ],
+    "a list that cannot be read lets nothing pass, of this MCU": [
+        *((KNOWN, False), (local_only(uid="spy-2"), False)),
+        (Message(f"{OUT}/{LIST}", b'{"topics": 5}', retain_requested=True), False),
+        *((value("lab/slow"), False), (value("mcu/spy-2/slow"), True)),
+    ],
+    "a list keeps no stop and no control of the robot back": [
+        (local_only("outgoing/estop-state/goob", "outgoing/control/goob"), False),
+        *((Message(f"{OUT}/{metric}", b"{}"), True) for metric in ("estop-state/goob", "control/goob")),
+    ],
+    "nonsense is neither an error nor held back": [
+        (KNOWN, False),
+        *((Message(f"{OUT}/strange", payload), True) for payload in NONSENSE),
+        (value("lab/slow"), True),
+    ],
+}
+
+
+@pytest.mark.parametrize("history", HISTORIES.values(), ids=HISTORIES)
+def test_what_passes(history: list[tuple[Message, bool | list[str]]]) -> None:
+    topics = LocalOnly(BASE)
+    for message, passes in history:
+        expected = [message.topic.removeprefix(f"{OUT}/")] if passes is True else passes or []
+        assert [admitted.topic.removeprefix(f"{OUT}/") for admitted in topics.admit(message)] == expected, message
+
+
+def test_which_commands_stay() -> None:
+    """Requests for a manifest do not leave the robot, nor commands to an MCU without a list."""
+    topics = LocalOnly(BASE)
+    incoming = [f"{BASE}/incoming/{metric}" for metric in ("mcu/spy-1/describe", "mcu/spy-1/tune", "mcu/spy-1/set")]
+    aliases = [f"{BASE}/incoming/{metric}" for metric in ("lab/tune", "lab/set", "estop", "drive-values")]
+    assert [topics.stays(topic) for topic in (*incoming, *aliases)] == [True] * 3 + [False] * 4
+    topics.admit(local_only(*TUNED, "incoming/estop"))
+    assert [topics.stays(topic) for topic in (*incoming, *aliases)] == [True, True, False, True, False, False, False]
+
+
+def test_memory_is_bounded() -> None:
+    topics = LocalOnly(BASE)
+    for number in range(300):
+        assert topics.admit(value(f"lab/slow-{number}", "slow", retain=True)) == []
+    assert len(topics.admit(KNOWN)) == 256, "waiting values"
+    for number in range(300):
+        topics.admit(local_only(uid=f"spy-{number}"))
+    slow = [Message(f"{OUT}/mcu/spy-{number}/slow", b"{}") for number in range(300)]
+    assert sum(len(topics.admit(message)) for message in slow) == 256, "MCUs"
+
+
+DOCUMENT = "".join((ROOT / "docs/ext" / name).read_text() for name in ("boards.md", "serial-protocol.md"))
+
+
+def test_the_examples_are_a_valid_manifest_and_valid_frames() -> None:
+    (code,) = re.findall(r"```python\n(.*?)```", DOCUMENT, re.DOTALL)
+    names: dict[str, Any] = {}
+    exec(code, names)
+    assert manifest.parse_hello(names["HELLO"]).device_uid == "lamp-1"
+    described = manifest.parse_describe(names["DESCRIBE"])
+    assert set(claims(described.payload()).granted) == {"incoming/lights/lamp", "outgoing/lights/lamp"}
+    request, command = (bytes.fromhex(found) for found in re.findall(r"`((?:[0-9a-f]{2} ){9,}00)`", DOCUMENT))
+    assert frame.decode(request[:-1]).type is frame.Type.DESCRIBE_REQ
+    assert frame.decode(command[:-1]) == frame.Frame(frame.Type.CMD, b"\x01", 3, 1)

@@ -1,17 +1,20 @@
-"""Two devices with one channel: neither gets it. Two with one uid: a warning. On every transport."""
+"""Two devices with one channel: neither gets it. Two with one uid: a warning. Our own firmware behind a pty."""
 
 from __future__ import annotations
 
 import logging
 import time
+from contextlib import closing
+from pathlib import Path
 
 import pytest
 
+from pebble.extensions.lab.simulation.pty import PtyMcu
 from pebble.transports import QoS
 from tests.ext.boards import mcu_wire as wire
 from tests.ext.boards.mcu_wire import IMU, LAMP, M, Received
 from tests.kit.board import SerialRig, motion
-from tests.support import until
+from tests.support import cases, until
 
 
 def imu(uid: str) -> M:
@@ -30,12 +33,10 @@ def test_a_channel_that_two_claim_is_unused_until_one_leaves(rig: SerialRig, cap
     assert rig.got("mcu/imu-2/imu_fast")
     time.sleep(0.1)
     before = len(rig.world.on("sensors/imu-fast"))
-    generic = len(rig.world.on("mcu/imu-1/imu_fast")), len(rig.world.on("mcu/imu-2/imu_fast"))
-    time.sleep(0.5)
+    due = {uid: len(rig.world.on(f"mcu/{uid}/imu_fast")) + 15 for uid in ("imu-1", "imu-2")}
+    assert until(lambda: all(len(rig.world.on(f"mcu/{uid}/imu_fast")) > count for uid, count in due.items()))
     assert len(rig.world.on("sensors/imu-fast")) == before
     assert {body["value"]["accel_mps2"]["x"] for body in rig.world.payloads("sensors/imu-fast")} == {1.0}
-    assert len(rig.world.on("mcu/imu-1/imu_fast")) > generic[0] + 15
-    assert len(rig.world.on("mcu/imu-2/imu_fast")) > generic[1] + 15
     warnings = [record.getMessage() for record in caplog.records if "both claim" in record.getMessage()]
     for claim in ("outgoing/sensors/imu-fast", "outgoing/sensors/imu"):
         warned = sorted(text for text in warnings if f"claim {claim}:" in text)
@@ -58,7 +59,6 @@ def test_of_two_that_claim_one_channel_that_of_the_config_has_it(
     two.stream(50, motion(2000))
     assert memory_rig.got("mcu/imu-1/imu_fast")
     assert until(lambda: "imu-1: outgoing/sensors/imu-fast is imu-2's by the config" in caplog.text)
-    time.sleep(0.5)
     assert memory_rig.world.on("sensors/imu-fast") == [], "nor before it is plugged in"
     two.plug()
     assert memory_rig.got("sensors/imu-fast")
@@ -114,3 +114,32 @@ def test_a_manifest_cleared_by_another_is_published_again(rig: SerialRig) -> Non
     other.publish(f"{rig.base}/outgoing/mcu/lamp-1/describe", b"", qos=QoS.DELIVERED, retain=True)
     assert until(lambda: len(rig.world.payloads("mcu/lamp-1/describe")) >= 2)
     rig.listener("late").described("lamp-1")
+
+
+FAST, SLOW = "sensors/imu-fast", "sensors/imu"
+PLUGGED_IN_S = 2.0
+
+
+@pytest.mark.alone
+def test_found_within_two_seconds_when_plugged_in_again_and_every_sample_arrives(tmp_path: Path) -> None:
+    uid = "goob-imu"
+    with closing(SerialRig("zenoh", tmp_path)) as rig, PtyMcu("goob_imu", rig.folder / "imu") as board:
+        running = rig.bridge("imu")
+        rig.described(uid)
+        board.unplug()
+        assert rig.cleared(f"mcu/{uid}/describe", timeout=2)
+        count, plugged = len(rig.world.on(FAST)), time.monotonic()
+        board.replug()
+        assert until(lambda: len(rig.world.on(FAST)) > count, 3)
+        assert rig.world.at[-1] - plugged < PLUGGED_IN_S
+        rig.described(uid)
+        time.sleep(cases(1, 5))
+        numbers = [body["seq"] for body in rig.world.payloads(FAST)[count:]]
+        assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+        assert len(numbers) >= 96 * cases(1, 5)
+        assert until(lambda: rig.world.on(SLOW))
+        fast, slow = rig.world.payloads(FAST)[-1], rig.world.payloads(SLOW)[-1]
+        assert fast["value"]["accel_mps2"]["z"] == pytest.approx(9.8, abs=0.5), "the board lies flat"
+        assert slow["value"]["accel_norm_g"] == pytest.approx(1.0, abs=0.05)
+        assert slow["value"]["health"]["samples_error"] == 0
+        assert running.alive

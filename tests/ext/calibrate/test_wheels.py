@@ -1,30 +1,118 @@
-"""Calibrations of wheels in a simulated room: the robot's firmware, its hall sensors, and a person who measures."""
+"""Calibrations of wheels in a simulated room, by a person, a tag or a gyroscope, and the command beside a robot."""
 
 from __future__ import annotations
 
 import json
 import math
 import random
-import re
-from collections.abc import Callable
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 
-from pebble.config import parse
-from pebble.contract import DRIVE
-from pebble.contract.payloads import Drive
+from pebble.contract import DRIVE, IMU_FAST, MOTOR_POWER, TOUCH_SENSORS
+from pebble.contract.payloads import Drive, TouchSensors
 from pebble.errors import PebbleError
-from pebble.extensions.calibrate.wheels import Wanted, check
+from pebble.extensions.calibrate.wheels import Wanted, calibrate, check
 from pebble.extensions.lab.simulation.motion import FULL_SPEED_MM_S, Wheels
-from pebble.extensions.scripts.perception.odometry import Calibration
+from pebble.extensions.lab.simulation.world.script_robot import SimulatedRobot
 from pebble.extensions.scripts.perception.tags import Place, Tag
-from tests.ext.calibrate.simulated import TAG, TRUE, Measured, measure
-from tests.support import ROOT, cases, some
+from tests.ext.scripts.perception.wheels_rig import powers, touches, turning
+from tests.ext.scripts.script.station import Station
+from tests.ext.scripts.shipped.stand_in import Sensors
+from tests.support import Child, cases, some, until
+
+TRUE = Wheels(61.0 * 1.01, 61.0 * 0.99, 130.5 * 1.03)
+ROOM = {"x_min": -0.5, "x_max": 2.4, "y_min": -2.0, "y_max": 2.0}
+TAG = {"id": 13, "x": 2.3, "y": 0.0, "z": 0.2, "yaw_deg": 180.0}
+
+
+class Measured(SimulatedRobot):
+    """A robot that publishes its hall sensors, and an inertial sensor if there is ``gyro``.
+
+    ``at_step`` is called at each step of the clock.
+    """
+
+    def __init__(self, folder: Path, wheels: Wheels = TRUE, *, gyro: bool = False, noise: random.Random) -> None:
+        sizes = {
+            "left_wheel_mm": wheels.left_diameter_mm,
+            "right_wheel_mm": wheels.right_diameter_mm,
+            "track_mm": wheels.track_mm,
+        }
+        world = {"room": ROOM, "tags": [TAG], "robots": {"goob": {"x": 0.0, "y": 0.0, **sizes}}}
+        (folder / "room.json").write_text(json.dumps(world))
+        super().__init__(folder / "room.json")
+        self.at_step: Callable[[], None] = lambda: None
+        self.turned = 0.0
+        self._gyro, self._noise, self._received = gyro, noise, b""
+        self._heading = self.body.pose.heading
+
+    def _pass_step(self) -> None:
+        super()._pass_step()
+        self.turned += math.remainder(self.body.pose.heading - self._heading, math.tau)
+        self._heading = self.body.pose.heading
+        found, self._received = touches(self._received + self.body.read(), lambda: self._noise.gauss(0, 2))
+        for values in found:
+            self.receive(TOUCH_SENSORS, TouchSensors(value=values))
+        if self._gyro and round(self.world.now() * 1000) % 10 == 0:
+            motion = self.body.motion
+            z = math.degrees((motion.right_mm_s - motion.left_mm_s) / motion.wheels.track_mm)
+            self.receive(IMU_FAST, turning(z + 0.3 + self._noise.gauss(0.0, 0.05), self.world.now()))
+        self.at_step()
+
+    def _drive(self, command: Drive) -> bool:
+        self.receive(MOTOR_POWER, powers(command))
+        return super()._drive(command)
+
+
+class Measurer:
+    """A person who puts the robot on the line before each run and measures after it, with a tape's and an eye's errors.
+
+    ``slips`` are what is typed wrongly: millimetres added to the way, by the number of the straight.
+    """
+
+    def __init__(self, robot: Measured, noise: random.Random, slips: dict[int, float] | None = None) -> None:
+        self.told: list[str] = []
+        self._robot, self._noise, self._slips = robot, noise, slips or {}
+        self._straights = 0
+        self._began = robot.body.pose
+        self._turned = 0.0
+
+    def tell(self, line: str) -> None:
+        self.told.append(line)
+
+    def ask(self, question: str) -> str:
+        robot, gauss = self._robot, self._noise.gauss
+        if "Enter drives" in question:
+            if "line" in question:
+                robot.body.place(1.6 if "back" in question else 0.0, 0.0, gauss(0, math.radians(0.3)))
+            self._began, self._turned = robot.body.pose, robot.turned
+            return ""
+        if "degrees" in question:
+            past = abs(robot.turned - self._turned) - 3 * math.tau
+            return f"{math.degrees(past) + gauss(0, 2):.0f}"
+        end, self._straights = robot.body.pose, self._straights + 1
+        along = abs(end.x - self._began.x) * 1000 + gauss(0, 2) + self._slips.pop(self._straights, 0.0)
+        beside = f" {end.y * 1000 + gauss(0, 3):.0f}" if "left of it" in question else ""
+        return f"{along:.0f}{beside}"
+
+
+def measure(folder: Path, seed: int = 0, wanted: Wanted | None = None, **options: Any) -> tuple[Measured, Measurer]:
+    """Run a whole calibration, or as much as is possible; ``at_step(robot)`` at each step of the clock."""
+    noise = random.Random(seed)
+    at_step, slips = options.pop("at_step", lambda _: None), options.pop("slips", None)
+    robot = Measured(folder, noise=noise, **options)
+    person = Measurer(robot, noise, slips)
+    robot.at_step = lambda: at_step(robot)
+    robot.run(lambda robot: calibrate(robot, person, wanted or Wanted(), robot.world.now), seconds=900)
+    return robot, person
+
 
 SHORT = {"length_m": 0.3, "straights": 4, "spins": 2}
 QUICK = Wanted(**SHORT)
@@ -43,25 +131,13 @@ def test_wheels_1_percent_and_a_track_3_percent_off_are_found(seed: int, tmp_pat
     signs = random.Random(seed)
     left, right, track = (1 + signs.choice((-1, 1)) * off for off in (0.01, 0.01, 0.03))
     true = Wheels(61.0 * left, 61.0 * right, 130.5 * track)
-    _, person = measure(tmp_path, seed, wheels=true)
+    measure(tmp_path, seed, wheels=true)
     *steps, track = off_percent(tmp_path, true)
     assert max(map(abs, steps)) < 0.3
     assert abs(track) < 0.5
     written = json.loads((tmp_path / "odometry.json").read_text())
     assert (written["version"], written["counts"], written["truth"], written["runs"]) == (1, "once", "tape", 8)
     assert written["residual_mm"] < 5
-    assert len([line for line in person.told if "steps" in line]) == len(
-        [line for line in person.told if "resid" in line]
-    )
-
-
-def test_a_gyroscope_measures_the_turns(tmp_path: Path) -> None:
-    measure(tmp_path, wanted=Wanted(truth="gyro", straights=4, length_m=0.8), gyro=True)
-    *steps, track = off_percent(tmp_path)
-    assert max(map(abs, steps)) < 0.3
-    assert abs(track) < 0.5
-    with pytest.raises(PebbleError, match="no inertial sensor that agrees with the wheels"):
-        measure(tmp_path, wanted=Wanted(truth="gyro", **SHORT))
 
 
 class Finder:
@@ -96,8 +172,11 @@ def finder(monkeypatch: pytest.MonkeyPatch) -> type[Finder]:
     return Finder
 
 
-def test_a_tag_measures_ways_and_turns_without_a_person(tmp_path: Path, finder: type[Finder]) -> None:
-    measure(tmp_path, wanted=Wanted(truth="tag", straights=4, length_m=0.8))
+@pytest.mark.parametrize("truth", ["tag", "gyro"])
+def test_a_tag_measures_ways_and_turns_without_a_person_and_a_gyroscope_the_turns(
+    tmp_path: Path, finder: type[Finder], truth: Any
+) -> None:
+    measure(tmp_path, wanted=Wanted(truth=truth, straights=4, length_m=0.8), gyro=truth == "gyro")
     *steps, track = off_percent(tmp_path)
     assert max(map(abs, steps)) < 0.3
     assert abs(track) < 0.5
@@ -142,6 +221,7 @@ def drive_by_hand(robot: Measured) -> None:
         ("tape", hold(0, 1), "1 of 6, straight there: it is not at its end after .* is it slower than --speed says"),
         ("tape", hold(1), r"1 of 6, straight there: a wheel has turned \d+ of 300 mm: does the other one turn"),
         ("tape", drive_by_hand, "1 of 6, straight there: it is not obeyed: a person drives"),
+        ("gyro", hide, "no inertial sensor that agrees with the wheels"),
     ],
 )
 def test_what_ends_a_leg_writes_nothing(
@@ -161,7 +241,7 @@ def test_what_ends_a_leg_writes_nothing(
     assert robots[0].body.motion.left_mm_s == 0
 
 
-@pytest.mark.parametrize("leg", some(range(7), 3))
+@pytest.mark.parametrize("leg", some(range(7), 4))
 def test_stop_in_any_leg_brings_it_to_rest_and_nothing_is_written(leg: int, tmp_path: Path) -> None:
     """Leg 0 is the rest before the first straight."""
     legs, moved, stopped = 0, False, []
@@ -212,8 +292,33 @@ def test_without_hall_sensors_the_key_is_named(tmp_path: Path, monkeypatch: pyte
     assert [path.name for path in tmp_path.iterdir()] == ["room.json"]
 
 
-def test_the_files_in_the_document(tmp_path: Path) -> None:
-    config, written = re.findall(r"```json\n(.*?)```", (ROOT / "docs/ext/calibrate.md").read_text(), re.DOTALL)
-    telemetry = parse(json.loads(config), folder=tmp_path, env={}).services.serial_mcu_bridge.telemetry
-    assert telemetry.publish_touch_sensors
-    assert msgspec.json.decode(written, type=Calibration).track_mm == 134.382
+@pytest.fixture
+def sensors() -> Iterator[Sensors]:
+    station = Station("zenoh")
+    sensors = Sensors(station)
+    yield sensors
+    sensors.close()
+    station.close()
+
+
+def test_an_emergency_stop_ends_it_and_nothing_is_written(sensors: Sensors) -> None:
+    station, ended = sensors.station, threading.Event()
+    rolling = threading.Thread(target=lambda: [sensors.roll(0.2, 0.0) for _ in iter(ended.is_set, True)])
+    rolling.start()
+    command = ["calibrate", "wheels", str(station.config_path), "--truth", "tag", "--length", "0.3"]
+    try:
+        program = Child(
+            [sys.executable, "-m", "pebble.cli", *command],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        )  # fmt: skip
+        assert until(lambda: station.moves(), 60), program.communicate(timeout=10)[0]
+        station.publish_state(latched=True, count=1, by="ann")
+        assert until(station.rests, 10)
+        said = program.communicate(timeout=30)[0]
+    finally:
+        ended.set()
+        rolling.join(10)
+    assert program.returncode == 3, said
+    assert "emergency stop by ann" in said
+    assert said.splitlines()[-1] == "pebble: ended; nothing was written"
+    assert not (station.folder / "odometry.json").exists()

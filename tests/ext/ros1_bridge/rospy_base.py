@@ -1,7 +1,4 @@
-"""The base of scripted.py with real rospy, at the master of the environment: ``rospy_base.py base NAME MASTER LOG``.
-
-``mux LOG``: a twist_mux, where a joystick goes before /cmd_vel, and /e_stop locks both; it logs what it lets pass.
-"""
+"""The base of scripted.py with real rospy, at the master of the environment: ``rospy_base.py base NAME MASTER LOG``."""
 
 import os
 import sys
@@ -79,26 +76,4 @@ def base():
             diagnostics.publish(message)
 
 
-def mux():
-    newest = {"joystick": (0.0, 0.0), "cmd": (0.0, 0.0)}
-    lock = {"on": False}
-
-    def take(source):
-        return lambda message: newest.__setitem__(source, (time.monotonic(), message.linear.x))
-
-    rospy.init_node("twist_mux", disable_signals=True)
-    rospy.Subscriber("/joy_teleop/cmd_vel", Twist, take("joystick"), queue_size=1)
-    rospy.Subscriber("/cmd_vel", Twist, take("cmd"), queue_size=1)
-    rospy.Subscriber("/e_stop", Bool, lambda message: lock.__setitem__("on", message.data), queue_size=1)
-    joystick = rospy.Publisher("/joy_teleop/cmd_vel", Twist, queue_size=1)
-    message = Twist()
-    message.linear.x = 0.7
-    while True:
-        time.sleep(0.05)
-        if do.exists():
-            joystick.publish(message)
-        fresh = [speed for at, speed in newest.values() if time.monotonic() - at < 0.5]
-        note("out", 0.0 if lock["on"] or not fresh else fresh[0])
-
-
-{"base": base, "mux": mux}[sys.argv[1]]()
+base()

@@ -53,13 +53,6 @@ def near(value, wanted, off):
     return abs(value - wanted) <= off
 
 
-def test_it_starts_and_reports_it():
-    bench = Bench()
-    assert bench.sample(11) == 10
-    assert bench.messages == [b"imu_ready"]
-    assert bench.imu.good == 10
-
-
 def test_units():
     bench = Bench()
     bench.device.raw = [G // 2, -G, G, 0, 655, -1310, 131]
@@ -72,9 +65,6 @@ def test_units():
     assert near(gy, -2000, 1)
     assert near(gz, 200, 1)
     assert celsius == 3653
-    bench.device.raw[3] = 340 * 10
-    bench.sample()
-    assert bench.imu.values[6] == 4653
     bench.device.raw[3] = -340 * 50
     bench.sample()
     assert bench.imu.values[6] == -1347
@@ -101,6 +91,7 @@ def test_it_learns_the_bias_of_the_gyroscope_at_rest():
     assert near(bench.imu.bias[1], -79, 1)
     assert near(bench.imu.bias[2], 44, 1)
     assert bench.imu.values[3:6] == [0, 0, 0]
+    assert bench.messages == [b"imu_ready"]
     bench.device.raw[4] += 655
     bench.sample()
     assert near(bench.imu.values[3], 1000, 1)
@@ -120,20 +111,18 @@ def test_it_does_not_learn_while_it_is_moved():
 
 
 def test_attitude_at_once_after_the_start():
-    bench = Bench()
-    for degrees in (-170, -90, -30, 0, 45, 120):
+    for degrees in (-170, -80, 0, 45, 80, 120):
         bench = Bench()
         angle = degrees * pi / 180
         bench.device.raw[1], bench.device.raw[2] = int(G * sin(angle)), int(G * cos(angle))
         bench.sample(2)
         assert near(bench.imu.values[7], degrees * 100, 5)
         assert near(bench.imu.values[8], 0, 5)
-    for degrees in (-80, -30, 30, 80):
-        bench = Bench()
-        angle = degrees * pi / 180
-        bench.device.raw[0], bench.device.raw[2] = int(-G * sin(angle)), int(G * cos(angle))
-        bench.sample(2)
-        assert near(bench.imu.values[8], degrees * 100, 5)
+        if abs(degrees) < 90:
+            bench = Bench()
+            bench.device.raw[0], bench.device.raw[2] = int(-G * sin(angle)), int(G * cos(angle))
+            bench.sample(2)
+            assert near(bench.imu.values[8], degrees * 100, 5)
 
 
 def test_free_fall_keeps_the_attitude():
@@ -145,26 +134,17 @@ def test_free_fall_keeps_the_attitude():
     assert near(bench.imu.values[7], 4500, 5)
 
 
-def test_one_failure_is_logged_and_ignored():
+def test_a_failure_is_logged_and_a_device_that_fell_asleep_or_is_another_is_set_up_anew():
     bench = Bench()
     bench.sample(10)
     bench.device.failures = 1
     assert bench.sample(10) == 9
-    assert bench.messages == [b"imu_ready", b"imu_read_failed"]
     assert (bench.imu.failed, bench.device.starts) == (1, 1)
-
-
-def test_a_device_that_fell_asleep_is_set_up_anew():
-    bench = Bench()
-    bench.sample(10)
     bench.device.raw = [0] * 7  # all its registers are 0 then, and it answers
     assert bench.sample(104) == 0
     bench.device.raw = [0, 0, G, 0, 0, 0, 0]
     assert bench.sample(11) == 10
-    assert bench.messages == [b"imu_ready", b"imu_read_failed", b"imu_reinit"]
-
-
-def test_another_device_at_its_address_is_refused():
+    assert bench.messages == [b"imu_ready"] + [b"imu_read_failed"] * 2 + [b"imu_reinit"]
     bench = Bench()
     bench.device.right = False
     assert bench.sample(101) == 0

@@ -7,28 +7,15 @@ here, before anything is measured. Time is virtual: `now` is milliseconds.
 import gc as _gc
 import os as _os
 import sys
-import time as _time
 
 modules = sys.modules
 now = 0
 
 
 class Time:
-    ticks_diff = staticmethod(_time.ticks_diff)
-    ticks_add = staticmethod(_time.ticks_add)
-
     @staticmethod
     def ticks_ms():
         return now
-
-    @staticmethod
-    def ticks_us():
-        return now * 1000
-
-    @staticmethod
-    def sleep_ms(ms):
-        global now
-        now += ms
 
 
 class Ring:
@@ -109,43 +96,30 @@ class Uart(Stdin, Stdout):
 
 
 class Sys:
-    platform = "standin"
-    implementation = sys.implementation
-    print_exception = sys.print_exception
     stdin, stdout = Stdin(), Stdout()
 
 
 Stdin.buffer, Stdout.buffer = Sys.stdin, Sys.stdout
 
 
-class Pin:
+class Part:
+    """A pin, a PWM or ADC channel, a timer, or the watchdog."""
+
     IN, OUT, PULL_UP, PULL_DOWN = 0, 1, 1, 2
-
-    def __init__(self, *_, **__):
-        pass
-
-    def value(self, *_):
-        return 0
-
-    __call__ = on = off = value
-
-
-class PWM:
-    def __init__(self, *_, **__):
-        pass
-
-    def duty_u16(self, duty=0):
-        assert 0 <= duty <= 65535
-        return duty
-
-    freq = deinit = init = duty_u16
-
-
-class ADC:
+    ONE_SHOT, PERIODIC = 0, 1
     ATTN_11DB = 3
 
     def __init__(self, *_, **__):
         pass
+
+    def value(self, *_, **__):
+        return 0
+
+    __call__ = on = off = freq = deinit = init = feed = value
+
+    def duty_u16(self, duty=0):
+        assert 0 <= duty <= 65535
+        return duty
 
     def read_u16(self):
         return now * 37 & 0xFFFF
@@ -171,35 +145,11 @@ class I2C:
             buffer[index] = 0
         buffer[4] = 0x20  # 1 g upwards
 
-    def readfrom(self, address, count):
-        return b"\0" * count
-
-
-class Timer:
-    ONE_SHOT, PERIODIC = 0, 1
-
-    def __init__(self, *_, **__):
-        pass
-
-    def init(self, *_, **__):
-        pass
-
-
-class WDT:
-    def __init__(self, *_, **__):
-        pass
-
-    def feed(self):
-        pass
-
 
 class Machine:
-    Pin, PWM, ADC, WDT, UART, Timer = Pin, PWM, ADC, WDT, Uart, Timer
+    Pin = PWM = ADC = WDT = Timer = Part
+    UART = Uart
     I2C = SoftI2C = I2C
-
-    @staticmethod
-    def unique_id():
-        return b"\x01\x02\x03\x04\x05\x06"
 
     @staticmethod
     def reset():
@@ -213,9 +163,6 @@ class Poll:
         self._stream = stream
         self._answer = ((stream, mask),)
         self._mask = mask
-
-    def unregister(self, stream):
-        self._stream = None
 
     def ready(self):
         if self._stream is Sys.stdin:
@@ -232,12 +179,12 @@ class Poll:
 
 
 class Select:
-    POLLIN, POLLOUT, POLLERR, POLLHUP = 1, 4, 8, 16
+    POLLIN, POLLOUT = 1, 4
     poll = Poll
 
 
 class Errno:
-    EINPROGRESS, EAGAIN, ECONNRESET, ETIMEDOUT = 115, 11, 104, 110
+    EINPROGRESS, EAGAIN = 115, 11
 
 
 class Os:

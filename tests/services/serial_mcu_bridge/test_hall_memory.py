@@ -9,14 +9,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from pebble.services.serial_mcu_bridge.text.hall_memory import HallMemory
 from tests.kit.hall_reader import HallReader
-from tests.services.serial_mcu_bridge.motor_rig import Bench
-from tests.support import until
 
 SLOTS = 64
 SECOND = 1_000_000_000
@@ -125,39 +122,3 @@ def test_what_is_not_its_own_stays_as_it_is(
         fill(memory, 3, second * SECOND)
     assert path.read_bytes() == before
     assert [record.message.partition(f"{path} ")[2][: len(text)] for record in caplog.records] == [text], "once"
-
-
-def is_whole(path: Path) -> bool:
-    """Programs of the original try again, too, while it is being made."""
-    try:
-        HallReader(path.name)
-    except (FileNotFoundError, ValueError):
-        return False
-    return True
-
-
-@pytest.mark.parametrize(
-    ("ring", "expected"),
-    [
-        ({}, True),
-        ({"enabled": False}, False),
-        (None, False),
-    ],
-    ids=str,
-)
-def test_a_bridge_keeps_every_line_of_its_board(tmp_path: Path, path: Path, ring: Any, expected: bool) -> None:
-    """It does so whether or not it publishes them."""
-    section = {} if ring is None else {"odometry_shm": {"name": path.name, **ring}}
-    bench = Bench(tmp_path, "goob", **section)
-    try:
-        assert until(lambda: is_whole(path), 3 if expected else 0.5) is expected
-        if expected:
-            reader = HallReader(path.name)
-            assert until(lambda: reader.newest >= 20)
-            samples = reader.read()
-            numbers = [sample.number for sample in samples]
-            assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
-            assert abs(samples[-1].at_ns - time.monotonic_ns()) < 5 * SECOND
-            assert bench.payloads("touch-sensors") == []
-    finally:
-        bench.close()

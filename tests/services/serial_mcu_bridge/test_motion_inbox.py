@@ -10,9 +10,6 @@ from pebble.motors.control import Control
 from pebble.motors.motion_inbox import MotionInbox
 from pebble.transports import State
 
-NAMES = [f"{number:016x}" for number in range(20)]
-
-
 ANN, OTTO = ControlRequest(id="aaaaaaaa", by="ann", for_ms=10_000), ControlRequest(id="00000001", by="otto")
 RELEASE = ControlRequest(id="aaaaaaaa", by="ann", want="release")
 
@@ -42,10 +39,8 @@ ZERO, FINAL, JOY = Drive(), Drive(valid_ms=0), Drive(x=1, source="joystick")
 WAITING = {
     "only the newest of a person": ([Drive(z=number / 10) for number in range(1, 11)], [Drive(z=1.0)]),
     "a zero before what replaces it": ([Drive(z=1), ZERO, Drive(z=0.5), Drive(z=0.25)], [ZERO, Drive(z=0.25)]),
-    "several zeros as one that still bars": ([FINAL, ZERO], [FINAL]),
-    "the same in the other order": ([ZERO, FINAL], [FINAL]),
-    "also with commands between": ([FINAL, Drive(z=1), ZERO, Drive(z=0.5)], [FINAL, Drive(z=0.5)]),
-    "and in the other order": ([ZERO, Drive(z=1), FINAL, Drive(z=0.5)], [FINAL, Drive(z=0.5)]),
+    "several zeros as one that still bars": ([FINAL, Drive(z=1), ZERO, Drive(z=0.5)], [FINAL, Drive(z=0.5)]),
+    "the same in the other order": ([ZERO, Drive(z=1), FINAL, Drive(z=0.5)], [FINAL, Drive(z=0.5)]),
     "a person and each run have their place": (
         [script(1), Drive(z=1), script(2), script(1, 0.0), JOY], [script(2), script(1, 0.0), JOY],
     ),
@@ -73,7 +68,7 @@ def test_any_number_of_runs_never_displaces_the_person() -> None:
 
 
 def test_a_zero_of_every_sender_is_always_there_whatever_follows() -> None:
-    for seed in range(300):
+    for seed in range(100):
         chance = random.Random(seed)
         inbox, zeros = empty(), set()
         for _ in range(chance.randrange(1, 30)):
@@ -85,26 +80,17 @@ def test_a_zero_of_every_sender_is_always_there_whatever_follows() -> None:
         assert len(waiting) <= 8
 
 
-def test_stops_have_one_place_per_name_and_are_bounded() -> None:
-    inbox = empty()
-    assert inbox.put_stop(EstopCommand(stop=NAMES[0]))
-    for name in NAMES:
-        assert not inbox.put_stop(EstopCommand(stop=name))
-        assert not inbox.put_stop(EstopCommand(stop=name))
-    assert [stop.stop for stop in inbox.take().stops] == NAMES[-8:]
-
-
-def test_the_first_put_after_a_take_is_marked() -> None:
-    inbox = empty()
+def test_stops_have_one_place_per_name_and_are_bounded_and_so_are_resets() -> None:
+    inbox, names = empty(), [f"{number:016x}" for number in range(20)]
     assert inbox.put_drive(Drive(), 0.0)
-    assert not inbox.put_reset(EstopReset(boot="a", count=1), 0.0)
-    assert not inbox.put_stop(EstopCommand())
+    for name in names:
+        assert not inbox.put_stop(EstopCommand(stop=name))
+        assert not inbox.put_stop(EstopCommand(stop=name))
+        assert not inbox.put_reset(EstopReset(boot="a", count=1), 0.0)
     batch = inbox.take()
-    assert (len(batch.stops), len(batch.resets), len(batch.drives)) == (1, 1, 1)
-    for _ in range(20):
-        inbox.put_reset(EstopReset(boot="a", count=1), 0.0)
-    assert len(inbox.take().resets) == 8
-    assert inbox.put_stop(EstopCommand())
+    assert [stop.stop for stop in batch.stops] == names[-8:]
+    assert (len(batch.resets), len(batch.drives)) == (8, 1)
+    assert inbox.put_stop(EstopCommand()), "the first after a take is marked"
 
 
 def test_strangers_displace_nothing_of_who_has_control_or_asks_for_it() -> None:
@@ -174,9 +160,7 @@ def test_the_newest_turn_of_each_owner_and_the_newest_vouched_time_wait_and_are_
     assert not inbox.put_turn("arm", arm)
 
 
-@pytest.mark.parametrize(("states", "lost"), [
-    ((), False), ((State.CONNECTED,), False), ((State.CONNECTING,), True), ((State.CONNECTING, State.CONNECTED), True),
-])  # fmt: skip
+@pytest.mark.parametrize(("states", "lost"), [((State.CONNECTED,), False), ((State.CONNECTING, State.CONNECTED), True)])
 def test_a_connection_that_was_lost_is_known_once(states: tuple[State, ...], lost: bool) -> None:
     inbox = empty()
     for state in states:
