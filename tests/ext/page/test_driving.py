@@ -640,16 +640,22 @@ def test_a_link_thins_out_what_moves_and_nothing_that_stops(world: World, level:
 
 def test_a_page_has_sixteen_robots_at_most(world: World) -> None:
     bases, refused = [f"pebble/robots/r{number}" for number in range(MOST_WISHES + 1)], list[str]()
-    for base in [*bases, bases[-1]]:
-        world.views[base], world.owners[base] = RobotView(base), KeepingRobot(base)
-        world.publish_capabilities(base, keeps=world.views[GOOB].controlled)
-        tab = world.tabs.get("ann") or world.connect("ann")
+    tab = world.connect("ann")
+
+    def take(base: str) -> int:
         world.drivers.take(tab, world.views[base], lambda: None, refused.append, over=False)
         world.settle()
-        if refused:
-            world.drivers.release(tab, bases[0])
-            world.wait(0.2)
+        return len(refused)
+
+    for base in bases:
+        world.views[base], world.owners[base] = RobotView(base), KeepingRobot(base)
+        world.publish_capabilities(base, keeps=world.views[GOOB].controlled)
+    assert sum(map(take, [*bases[:-1], bases[0]])) == 0
+    assert take(bases[-1]) == 1
     assert refused == ["This page has control of 16 robots: release one"]
+    world.drivers.release(tab, bases[0])
+    world.wait(0.2)
+    assert take(bases[-1]) == 1
 
 
 def test_pages_are_told_whenever_who_drives_changes(world: World) -> None:
@@ -670,6 +676,8 @@ def test_who_gets_and_gives_control_and_moves_wheels_is_known_for_the_audit(worl
     drive = lambda g, z: world.drivers.drive(ann, DriveOp(ref=GOOB, g=g, t=1000 * world.now, z=z), "")
     assert [drive(1, 0.5), drive(1, 0.5), drive(1, 0.0)] == [(True, ""), (False, ""), (False, "")]
     assert drive(1, 0.5) == (False, "Let go first")
+    world.perform(["deaf"])
+    assert drive(2, 0.5) == (False, "The server cannot reach the broker")
     assert [world.drivers.release(tab, GOOB) for tab in (bob, ann, ann)] == [False, True, False]
 
 
