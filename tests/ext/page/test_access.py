@@ -21,6 +21,7 @@ from starlette.routing import Route
 
 from pebble.extensions.fleet import certificates
 from pebble.extensions.fleet.audit import Audit
+from pebble.extensions.fleet.database import DatabaseError
 from pebble.extensions.fleet.people import SESSION_S, People
 from pebble.extensions.fleet.roles import Role
 from pebble.extensions.page.access import guard as guard_module
@@ -348,6 +349,17 @@ def test_wrong_passwords_and_unknown_names_have_the_same_answer(site: Site) -> N
     assert wrong.content == unknown.content == b'{"ok":false,"why":"User or password is wrong"}'
     assert wrong.headers == unknown.headers
     assert until(lambda: [(one.what, one.user) for one in site.audit.read(10)] == [("login-refused", "alice")])
+
+
+def test_while_the_database_cannot_be_written_a_login_says_so(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    def is_full(*_: object) -> None:
+        raise DatabaseError(None, OSError("disk is full"))
+
+    for step in ("check", "start_session"):
+        with monkeypatch.context() as patched:
+            patched.setattr(site.people, step, is_full)
+            assert site.run(site.log_in).status_code == 503, step
+    assert site.run(site.log_in).status_code == 200
 
 
 def test_password_hashes_hold_up_nothing_else(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
