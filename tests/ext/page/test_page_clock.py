@@ -13,13 +13,13 @@ OFFSET_S = 5000.0  # of the page's clock
 class Page:
     """A page whose messages take ``up`` and ``down`` seconds."""
 
-    def __init__(self, up: float, down: float) -> None:
+    def __init__(self, up: float, down: float, *, drift: float = 0.0) -> None:
         self.clock = PageClock()
-        self.up, self.down = up, down
+        self.up, self.down, self.drift = up, down, drift
         self.now = 100.0
 
     def page_ms(self, at: float) -> float:
-        return 1000 * (OFFSET_S + at)
+        return 1000 * (OFFSET_S + at * (1 + self.drift))
 
     def ping(self, times: int = 1) -> Page:
         for _ in range(times):
@@ -92,6 +92,12 @@ def test_a_jump_of_the_pages_clock_ends_the_connection(jump: float) -> None:
 def test_a_command_from_the_future_ends_the_connection() -> None:
     with pytest.raises(ClockJumpError):
         Page(0.003, 0.003).ping(3).late(-1.5)
+
+
+@pytest.mark.parametrize("drift", [0.001, -0.001])
+def test_clocks_may_drift_apart_for_long(drift: float) -> None:
+    page = Page(0.02, 0.02, drift=drift).ping(7200)
+    assert [page.late(age) for age in (0.02, 0.62)] == [False, True]
 
 
 def test_an_echo_of_no_ping_is_ignored() -> None:

@@ -10,6 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pebble.contract import CAPABILITIES, codec
+from pebble.contract.payloads import Capabilities
 from pebble.extensions.fleet.audit import Audit
 from pebble.extensions.fleet.people import People
 from pebble.extensions.operator.client.robot_view import RobotView
@@ -133,6 +135,26 @@ def test_what_does_not_fit_into_a_message_waits_behind_what_is_open(monkeypatch:
     assert parts[0][0] == refs[30]
     assert len(parts) > 3
     assert sorted(ref for part in parts for ref in part) == sorted(refs)
+
+
+def test_large_values_are_sent_one_at_a_time() -> None:
+    robots, interest = Robots(), Interest(lambda: None)
+    robots.join(interest)
+    for name in ("a", "b"):
+        topic = f"pebble/robots/{name}/outgoing/capabilities"
+        robots.receive(Message(topic, codec.encode(CAPABILITIES, Capabilities(t=1, value={"x": "y" * 20_000}))), 0.0)
+    robots.set_server_metric("", "web/broker", {"connected": True})
+
+    def taken(*, large: bool) -> tuple[set[str], bool]:
+        values, had = robots.take(interest, 1.0, large=large)
+        return {ref.rpartition("/")[2] for ref, metric, *_ in values if metric == "capabilities"}, had
+
+    assert taken(large=False) == (set(), False)
+    first, had = taken(large=True)
+    assert had
+    assert taken(large=False) == (set(), False)
+    assert (first | taken(large=True)[0], len(first)) == ({"a", "b"}, 1)
+    assert taken(large=True) == (set(), False)
 
 
 # -- what pages get of outlets, microcontrollers and cards
