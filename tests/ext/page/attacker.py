@@ -98,9 +98,8 @@ class Everything:
         self._transport.subscribe("#", self.messages.append, direct=True)
 
     def incoming(self, base: str = "") -> set[str]:
-        """Topics of commands, to this component or to any."""
-        topics = {message.topic for message in list(self.messages)}
-        return {topic for topic in topics if "/incoming/" in topic and topic.startswith(base)}
+        """Return the topics of commands, to this component or to any."""
+        return {one.topic for one in list(self.messages) if "/incoming/" in one.topic and one.topic.startswith(base)}
 
     def close(self) -> None:
         self._transport.close()

@@ -75,7 +75,7 @@ class State:
     at: int = 0  # ms epoch, at which the server's time stands still; 0: it does not
     logs: Callable[[int], list[Any]] = field(default=lambda _now: [])  # lines of the component that is open
     recordings: bool = False  # those of tests.ext.page.recorded are offered
-    days: tuple[int, str] | None = None  # status and text that a list of recorded days is answered with; status 0: none
+    days: tuple[int, str] | None = None  # status and text that a list of recorded days is answered with
     audit: list[Any] = field(default_factory=list)  # of a robot, as it is read
 
 
@@ -163,10 +163,10 @@ class CannedServer:
             return route
 
         async def days(request: Request) -> Response:
-            status, text = self.state.days or (200, "")
-            if not status:
-                await asyncio.Event().wait()
-            return Response(text, status) if self.state.days else await route.endpoint(request)
+            if self.state.days is None:
+                return await route.endpoint(request)
+            status, text = self.state.days
+            return Response(text, status)
 
         return Route(route.path, days)
 
@@ -178,9 +178,6 @@ class CannedServer:
         return HTMLResponse(
             "<body style='background: #2a6; color: #fff'>The robot's own stream<script>self.ran = 1</script>"
         )
-
-    def _filled(self, text: str) -> str:
-        return text.replace("{port}", str(self.port))
 
     async def _static(self, request: Request) -> Response:
         return self.static.answer(request, request.path_params["name"], _headers())
@@ -278,7 +275,7 @@ class CannedServer:
 
     async def _send(self, websocket: WebSocket, message: dict[str, Any]) -> None:
         if websocket.application_state is WebSocketState.CONNECTED:
-            await websocket.send_text(self._filled(json.dumps(message)))
+            await websocket.send_text(json.dumps(message).replace("{port}", str(self.port)))
 
     async def _media(self, websocket: WebSocket) -> None:
         await websocket.accept()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import sys
-import threading
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -17,10 +16,6 @@ def killed(answer: Connection, *_: Any) -> None:
 
 def ended(_answer: Connection, *_: Any) -> None:
     sys.exit(3)
-
-
-def silent(_answer: Connection, *_: Any) -> None:
-    threading.Event().wait()
 
 
 def stopped(answer: Connection, *_: Any) -> None:

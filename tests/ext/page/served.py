@@ -19,9 +19,6 @@ from pebble.transports import MqttSettings
 from tests.kit.played_robot import RecordingRobot
 from tests.support import until
 
-#: The state of a motor owner that is not stopped.
-FREE = {"latched": False, "boot": "b", "count": 0, "recent": [], "by": "", "why": "", "since": 0}
-
 
 class Served:
     """One server on a free loopback port; everything runs in this process, except the broker."""
@@ -73,13 +70,7 @@ class Page:
     """What a page's control socket does: hello, echoes, and whatever a test sends."""
 
     def __init__(
-        self,
-        served: Served,
-        *,
-        device: str = "test",
-        name: str = "",
-        version: str | None = None,
-        cookie: str = "",
+        self, served: Served, *, device: str = "test", name: str = "", version: str = "", cookie: str = ""
     ) -> None:
         headers = {"cookie": cookie} if cookie else None
         self.state: dict[tuple[str, str], Any] = {}
@@ -95,8 +86,7 @@ class Page:
         )
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
-        version = served.version if version is None else version
-        self.send("hello", version=version, device=device, name=name)
+        self.send("hello", version=version or served.version, device=device, name=name)
         assert until(lambda: self.welcome or self.closed, 30)
 
     def send(self, op: str, **fields: Any) -> None:

@@ -14,7 +14,7 @@ from tests.ext.boards import mcu_wire as wire
 from tests.ext.page.canned import State, Value
 
 GOOB, FRED, LAMP, BENJR = (f"pebble/robots/{name}" for name in ("goob", "fred", "minilamp", "benjr"))
-TOWER, EVE, SAT = "pebble/towers/tower-1", "pebble/people/eve", "pebble/satellites/cube-3"
+TOWER, EVE = "pebble/towers/tower-1", "pebble/people/eve"
 GOOB_PATH = f"/r/{GOOB}"
 #: When recordings of goob begin, 10:00 UTC of 22 November 2026, and the time between them.
 START = 1_795_341_600_000
@@ -255,18 +255,6 @@ def stopped(ref: str, by: str, **more: Any) -> Callable[[int], Value]:
     return lambda now: (ref, "web/estop", estop(now, by, **more), 200)
 
 
-def satellite(now: int) -> list[Value]:
-    """A component of a type that this page does not know, beside the fleet."""
-    position = {"t": now, "value": {"lat_deg": 52.1, "lon_deg": 13.4, "alt_km": 412.5, "mode": "sun pointing"}}
-    return [
-        *fleet(now),
-        (SAT, "web/liveness", liveness(latency_ms=640.0), 100),
-        (SAT, "status", position, 300),
-        (SAT, "diagnostics", {"value": {"panels": [4.1, 4.2, 0.0], "safe_mode": False, "uptime_s": 86213}}, 1500),
-        (SAT, "charging-level", {"value": 81.0, "unit": "%"}, 2500),
-    ]
-
-
 def odometry(seconds: float) -> dict[str, Any]:
     """On a loop of 1.6 m, as the script wheel-odometry publishes it."""
     angle = seconds / 8
@@ -392,7 +380,6 @@ STATES: dict[str, State] = {
     "fleet-thousand": State("/", many(1000, 97, 53, 41)),
     "fleet-empty": State("/", lambda _now: []),
     "fleet-lost": State("/", fleet, silent=True),
-    "fleet-watching": of("/?watch"),
     "driving": DRIVING,
     "operating": OPERATING,
     "recordings": REPLAYING,
@@ -400,10 +387,8 @@ STATES: dict[str, State] = {
     "replay-gap": replace(REPLAYING, path=f"/replay/{GOOB}?at={GAP[0] + 60_000}"),
     "recordings-none": replace(REPLAYING, days=(200, "[]")),
     "recordings-failed": replace(REPLAYING, days=(422, "/data/recordings: Permission denied")),
-    "recordings-loading": replace(REPLAYING, days=(0, "")),
     "recordings-lost": replace(REPLAYING, days=(200, "[]"), silent=True),
     "driving-recorded": replace(DRIVING, welcome={"recordings": True}),
-    "system-offline": replace(OPERATING, values=changed(fleet, SILENT)),
     "watching": of(f"{GOOB_PATH}?watch", stopped(FRED, "eve on phone")),
     "free": of(GOOB_PATH),
     "odometry": SENSORS,
@@ -435,10 +420,8 @@ STATES: dict[str, State] = {
     "old-page": replace(DRIVING, welcome={"version": "of another server"}),
     "plain-http": replace(DRIVING, welcome={"drives": False}),
     "tower": of(f"/r/{TOWER}"),
-    "person": of(f"/r/{EVE}"),
     "devices": of(GOOB_PATH, MINE, base=devices, repeated={**LIVE, "mcu/lamp-1/glow": 0.2}),
     "devices-viewer": of(GOOB_PATH, base=devices, welcome=VIEWER),
-    "satellite": of(f"/r/{SAT}", base=satellite),
     "no-camera": of(f"/r/{LAMP}"),
     "other-camera": of(
         GOOB_PATH, MINE, at(GOOB, "web/picture-from", {"source": TOWER}), at(TOWER, "web/picture", flow()), logs=logs

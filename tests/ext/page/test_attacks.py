@@ -1,14 +1,12 @@
-"""What an attacker with a browser, or with a socket, tries against the real server; each attempt is refused."""
+"""Attempts of an attacker with a browser, or with a socket, against the real server: each is refused."""
 
 from __future__ import annotations
 
 import json
 import socket
-import sqlite3
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -25,10 +23,11 @@ from pebble.extensions.page import messages as m
 from tests.ext.page.attacker import PASSWORDS, Everything, Hall
 from tests.ext.page.served import Page, Served, now_ms
 from tests.kit.played_robot import RecordingRobot
-from tests.support import Broker, beside, cases, until
+from tests.support import Broker, until
 
 GOOB = "pebble/robots/goob"
 OWNER = {"owner": "serial", "boot": "00000000", "count": 1}
+STOP = {"op": "estop", "ref": GOOB, "stop": "0123456789abcdef"}
 PUBLIC = {"/login", "/ca.pem", "/healthz", "/api/login", "/api/logout"}
 HERE = Path(__file__).resolve().parents[3] / "pebble/extensions/page"
 
@@ -52,15 +51,6 @@ def goob(broker: Broker) -> Iterator[RecordingRobot]:
         yield robot
 
 
-@pytest.fixture(scope="module")
-def driver(hall: Hall, goob: RecordingRobot) -> Iterator[Page]:
-    """An honest page beside the attacks."""
-    with hall.page("driver") as page:
-        assert page.knows(GOOB)
-        assert page.ready()
-        yield page
-
-
 def raw(hall: Hall, request: bytes) -> bytes:
     """The answer to these bytes."""
     with socket.create_connection(("127.0.0.1", hall.served.port), 10) as client:
@@ -71,28 +61,16 @@ def raw(hall: Hall, request: bytes) -> bytes:
 # -- other sites
 
 
-FOREIGN = (None, "http://evil.test")
-
-
-def test_another_site_opens_no_socket_posts_nothing_and_is_served_nothing(
-    hall: Hall, driver: Page, everything: Everything
-) -> None:
-    """The guard, which test_guard has, stands before every route."""
-    cookie, body = hall.cookie("admin"), {"ref": GOOB, "stop": "0123456789abcdef", "op": "estop"}
+def test_another_site_opens_no_socket_posts_nothing_and_is_served_nothing(hall: Hall, everything: Everything) -> None:
+    """The guard, which test_access has, stands before every route."""
+    cookie, origin = hall.cookie("admin"), "http://evil.test"
     for path in hall.routes(WebSocketRoute):
-        for origin in FOREIGN:
-            assert hall.refusal(f"{path}?ref={GOOB}&can=json", cookie=cookie, origin=origin) == 403, (path, origin)
-    paths = set(hall.routes(Route, "POST"))
-    assert {"/api/estop", "/api/login", "/api/logout"} <= paths
+        assert hall.refusal(f"{path}?ref={GOOB}&can=json", cookie=cookie, origin=origin) == 403, path
     with hall.client("admin") as client:
-        for path in paths:
-            for origin in FOREIGN:
-                for content in ({"json": body}, {"data": body}):
-                    answer = client.post(path, headers={"origin": origin} if origin else {}, **content)
-                    assert (answer.status_code, answer.text) == (403, "this request comes from another site\n"), path
-                    assert "set-cookie" not in answer.headers
+        for path in hall.routes(Route, "POST"):
+            assert client.post(path, headers={"origin": origin}, data=STOP).status_code == 403, path
         assert client.get("/").status_code == 200, "the session has ended"
-    for path in ("/", "/login", "/healthz", "/ca.pem", f"/static/{hall.served.version}/main.js"):
+    for path in hall.routes(Route, "GET"):
         request = f"GET {path} HTTP/1.1\r\nHost: evil.test\r\nCookie: {cookie}\r\nConnection: close\r\n\r\n"
         assert raw(hall, request.encode()).startswith(b"HTTP/1.1 421 ")
     assert not {topic for topic in everything.incoming() if topic.endswith("/estop")}
@@ -101,25 +79,14 @@ def test_another_site_opens_no_socket_posts_nothing_and_is_served_nothing(
 # -- without a session
 
 
-def expired(hall: Hall) -> str:
-    cookie = hall.cookie("admin")
-    database = sqlite3.connect(str(hall.served.settings.people))
-    with database:
-        database.execute("UPDATE sessions SET expires = ? WHERE started = (SELECT MAX(started) FROM sessions)", (1.0,))
-    database.close()
-    return cookie
-
-
 def revoked(hall: Hall) -> str:
     cookie = hall.cookie("admin")
     hall.people.end_session(cookie.partition("=")[2])
     return cookie
 
 
-def test_without_a_session_there_is_nothing(hall: Hall, driver: Page, everything: Everything) -> None:
-    cookies = {"none": "", "odd": "pebble=x", "expired": expired(hall), "revoked": revoked(hall)}
-    cookies["of https"] = "__Host-" + hall.cookie("admin")
-    body = {"op": "estop", "ref": GOOB, "stop": "0123456789abcdef"}
+def test_without_a_session_there_is_nothing(hall: Hall, everything: Everything) -> None:
+    cookies = {"none": "", "revoked": revoked(hall), "of https": "__Host-" + hall.cookie("admin")}
     for kind, cookie in cookies.items():
         for path in hall.routes(WebSocketRoute):
             assert hall.refusal(f"{path}?ref={GOOB}&can=json", cookie=cookie) == 403, (kind, path)
@@ -129,14 +96,14 @@ def test_without_a_session_there_is_nothing(hall: Hall, driver: Page, everything
                     assert client.get(path).status_code in (303, 401), (kind, path)
             for path in hall.routes(Route, "POST"):
                 if path not in PUBLIC:
-                    answer = client.post(path, json=body, headers={"origin": hall.served.origin})
+                    answer = client.post(path, json=STOP, headers={"origin": hall.served.origin})
                     assert answer.status_code == 401, (kind, path)
-            form = client.post("/api/estop", data=body, headers={"origin": hall.served.origin})
+            form = client.post("/api/estop", data=STOP, headers={"origin": hall.served.origin})
             assert (form.status_code, "log in first" in form.text) == (401, True), kind
     assert not {topic for topic in everything.incoming() if topic.endswith("/estop")}
 
 
-@pytest.mark.parametrize("how", ["removed", "role", "logout"])
+@pytest.mark.parametrize("how", ["role", "logout"])
 def test_a_session_that_is_revoked_while_driving_ends(hall: Hall, broker: Broker, how: str) -> None:
     base = f"pebble/robots/revoked-{how}"
     hall.people.add(f"mallory-{how}", "sentinel of mallory", Role.DRIVER)
@@ -146,9 +113,7 @@ def test_a_session_that_is_revoked_while_driving_ends(hall: Hall, broker: Broker
         assert page.ready()
         pictures = hall.socket(f"/ws/media?ref={base}&can=json", cookie=cookie)
         assert page.moves(robot)
-        if how == "removed":
-            hall.people.remove("mallory-removed")
-        elif how == "role":
+        if how == "role":
             hall.people.set_role("mallory-role", Role.VIEWER)
         else:
             headers = {"cookie": cookie, "origin": hall.served.origin}
@@ -201,9 +166,7 @@ FOR_VIEWERS = {"hello", "echo", "watch", "read-logs", "stop", "estop", "estop-en
 
 
 @pytest.mark.parametrize(("role", "may"), [("viewer", FOR_VIEWERS), ("driver", set(ops("")) - {"action", "board"})])
-def test_what_a_role_may_not(
-    hall: Hall, broker: Broker, driver: Page, everything: Everything, role: str, may: set[str]
-) -> None:
+def test_what_a_role_may_not(hall: Hall, broker: Broker, everything: Everything, role: str, may: set[str]) -> None:
     base, asked = f"pebble/robots/seen-by-{role}", sorted(set(ops(GOOB)) - may)
     assert set(ops(GOOB)) == {kind.__struct_config__.tag for kind in get_args(m.FromPage)}
     with RecordingRobot(broker.port, base) as robot, hall.page(role) as page:
@@ -214,100 +177,64 @@ def test_what_a_role_may_not(
         assert until(lambda: len(page.refused) >= len(asked)), page.refused
         why = f"The role {role} may not do this"
         assert [(one["cmd"], one["why"]) for one in page.refused] == [(op, why) for op in asked]
-        assert not page.closed
         with hall.client(role) as client:
             assert client.get("/api/audit", params={"ref": base}).status_code == 403
         time.sleep(0.2)
-        assert robot.received == []
         assert everything.incoming(base) == set()
-        assert driver.value(base, "web/driver", "by") == ""
-
-
-def test_a_viewer_may_stop_and_is_offered_nothing_else(hall: Hall, broker: Broker) -> None:
-    base = "pebble/robots/stopped-by-viewer"
-    with RecordingRobot(broker.port, base) as robot, hall.page("viewer", device="phone") as page:
-        assert (page.welcome["user"], page.welcome["role"], page.welcome["rights"]) == ("viewer", "viewer", [])
-        assert page.knows(base)
-        page.send("estop", ref=base, stop="00000000000000aa")
-        assert until(lambda: robot.latched)
-        assert until(lambda: page.value(base, "web/estop", "latched"))
-        page.send("estop-reset", **ops(base)["estop-reset"])
-        assert until(lambda: page.refused)
-        assert robot.latched
+        page.send("estop", ref=base, stop=role.encode().hex().zfill(16))
+        assert until(lambda: robot.latched), "each may stop"
 
 
 # -- paths
 
 
-TRAVERSALS = [
-    "../server.py", "..%2fserver.py", "%2e%2e%2fserver.py", "..%252fserver.py", "..%5cserver.py", "....//server.py",
-    "core/../../server.py", "%2fetc%2fpasswd", "//etc/passwd", "main.js%00.py", "..;/server.py", "..%c0%afserver.py",
-    "core", "", "file:///etc/passwd",
-]  # fmt: skip
+TRAVERSALS = ["../server.py", "..%2fserver.py", "..%252fserver.py", "..%5cserver.py", "//etc/passwd", "main.js%00.py"]
 
 
 def test_nothing_but_the_pages_files_is_served(hall: Hall) -> None:
     secrets = (HERE / "server.py").read_bytes()[:60], b"root:", b"Traceback"
     for path in TRAVERSALS:
-        versions = (hall.served.version, "..", "%2e%2e", "x")
-        for place in (
-            *(f"/static/{version}/{path}" for version in versions),
-            f"/static/{path}",
-            f"/r/{path}",
-            f"/{path}",
-        ):
-            request = f"GET {place} HTTP/1.1\r\nHost: 127.0.0.1:{hall.served.port}\r\nConnection: close\r\n\r\n"
-            answer = raw(hall, request.encode("latin-1", "replace"))
-            assert answer.split(b" ", 2)[1] in (b"303", b"307", b"400", b"404"), (place, answer[:100])
-            assert [secret for secret in secrets if secret in answer] == [], place
+        for place in ("", "r/", "static/", "static/../", f"static/{hall.served.version}/"):
+            request = f"GET /{place}{path} HTTP/1.1\r\nHost: 127.0.0.1:{hall.served.port}\r\nConnection: close\r\n\r\n"
+            answer = raw(hall, request.encode())
+            assert answer.split(b" ", 2)[1] in (b"303", b"307", b"400", b"404"), (place, path, answer[:100])
+            assert [secret for secret in secrets if secret in answer] == [], (place, path)
 
 
 # -- the control socket
 
 
-def bad_messages() -> dict[str, str | bytes]:
-    drive = '{"op":"drive","ref":"%s","g":%s,"t":%s,"x":0,"z":%s}'
-    values = ("NaN", "-Infinity", "1e999", "1.001", '"0.5"')
-    return {
-        **{f"z={value}": drive % (GOOB, 1, int(now_ms()), value) for value in values},
-        "t is infinite": drive % (GOOB, 1, "Infinity", "0.5"),
-        "g is huge": drive % (GOOB, "1e100", 1, 0.5),
-        "g is negative": drive % (GOOB, -1, 1, 0.5),
-        "17 KB": json.dumps({"op": "watch", "ref": GOOB, "more": "x" * 17 * 1024}),
-        "ref of 201": json.dumps({"op": "watch", "ref": "x" * 201}),
-        "deep list": "[" * 16_000,
-        "unknown op": '{"op":"reboot","ref":"x"}',
-        "not JSON": "drive!",
-        "half a surrogate": '{"op":"watch","ref":"\\ud800"}',
-        "hello again": '{"op":"hello","version":"x"}',
-        "binary": b'{"op":"stop","ref":"x"}',
-        "stop with another line": '{"op":"estop","ref":"","stop":"0123456789abcdef\\n"}',
-        "many owners": json.dumps({"op": "estop-reset", "ref": GOOB, "owners": [OWNER] * 17}),
-    }
+_DRIVE = '{"op":"drive","ref":"pebble/robots/goob","g":%s,"t":%s,"x":0,"z":%s}'
+#: No messages of the contract: each would be one but for a detail.
+BAD_MESSAGES: dict[str, str | bytes] = {
+    "z is NaN": _DRIVE % (1, 1, "NaN"),
+    "z is too large": _DRIVE % (1, 1, "1.001"),
+    "t is infinite": _DRIVE % (1, "Infinity", 0.5),
+    "17 KB": json.dumps({"op": "watch", "ref": GOOB, "more": "x" * 17 * 1024}),
+    "deep list": "[" * 16_000,
+    "half a surrogate": '{"op":"watch","ref":"\\ud800"}',
+    "hello again": '{"op":"hello","version":"x"}',
+    "binary": b'{"op":"stop","ref":"x"}',
+}
 
 
-@pytest.mark.parametrize("kind", sorted(bad_messages()))
+@pytest.mark.parametrize("kind", BAD_MESSAGES)
 def test_what_is_not_understood_ends_the_connection_and_moves_nothing(
-    hall: Hall, goob: RecordingRobot, driver: Page, kind: str
+    hall: Hall, goob: RecordingRobot, kind: str
 ) -> None:
     with hall.page("admin") as page:
         assert page.knows(GOOB)
         assert page.ready()
         assert page.take(GOOB)
         since = time.monotonic()
-        page.send_raw(bad_messages()[kind])
+        page.send_raw(BAD_MESSAGES[kind])
         assert until(lambda: page.closed, 3)
         assert page.bye["why"]
-        assert "Traceback" not in page.bye["why"]
         assert not [one for one in goob.drives(since) if one["x"] or one["z"]]
-    assert not driver.closed
 
 
-HOSTILE_REFS = [
-    "#", "+/+/+", "pebble/robots/#", "pebble/robots/goob/incoming/drive-values", "pebble/robots", "$SYS/broker/uptime",
-    "/pebble/robots/goob", "pebble/robots/goob/", "pebble/robots/\u0000", "pebble/robots/../../x", "__proto__",
-]  # fmt: skip
-UNKNOWN_REFS = ["pebble/servers/hall", "pebble/robots/unknown"]  # a robot that is off is stopped when it comes
+UNKNOWN = "pebble/robots/unknown"  # a robot that is off is stopped when it comes
+REFS = ["#", f"{GOOB}/incoming/drive-values", f"/{GOOB}", "pebble/robots/\0", "__proto__", UNKNOWN]
 
 
 def test_names_of_robots_are_no_topics(hall: Hall, goob: RecordingRobot, everything: Everything) -> None:
@@ -315,7 +242,7 @@ def test_names_of_robots_are_no_topics(hall: Hall, goob: RecordingRobot, everyth
     with hall.page("admin") as page, hall.client("admin") as client:
         assert page.knows(GOOB)
         assert page.ready()
-        for ref in HOSTILE_REFS + UNKNOWN_REFS:
+        for ref in REFS:
             published = len(everything.messages)
             for op, fields in ops(ref).items():
                 if op not in {"hello", "echo"}:
@@ -325,23 +252,19 @@ def test_names_of_robots_are_no_topics(hall: Hall, goob: RecordingRobot, everyth
             time.sleep(0.3)
             assert not page.closed, (ref, page.bye)
             sent = {one.topic for one in everything.messages[published:] if "/incoming/" in one.topic}
-            named = UNKNOWN_REFS if ref in UNKNOWN_REFS else []  # stops are repeated until they arrive
-            assert sent <= {f"{one}/incoming/{metric}" for one in named for metric in ("estop", "drive-values")}, ref
+            repeated = {f"{UNKNOWN}/incoming/estop", f"{UNKNOWN}/incoming/drive-values"}
+            assert sent <= (repeated if ref == UNKNOWN else set()), ref
             page.send("estop-end", stop="0123456789abcdef")
             assert hall.refusal(f"/ws/media?ref={quote(ref)}", cookie=cookie) == 403, ref
 
 
-def test_a_viewer_does_not_talk(hall: Hall, driver: Page) -> None:
+def test_a_viewer_does_not_talk(hall: Hall, goob: RecordingRobot) -> None:
     with hall.socket(f"/ws/sound?ref={GOOB}&can=opus", cookie=hall.cookie("viewer")) as talker:
         talker.send(b"\x01" + bytes(648))
         assert json.loads(talker.recv(timeout=5)) == {"talk": 0, "on": False, "why": "The role viewer may not do this"}
 
 
-ODD_BODIES = [
-    *(b"", b"\xff", b"{", b"[" * 16_000, b"null", b'{"op":"estop","ref":"\xff"}', b"x" * 17_000),
-    *(b'{"user":1,"password":2}', b'{"user":["admin"],"password":"x"}', b'{"user":"\\ud800","password":"x"}'),
-    b'{"user":"x","password":"' + b"x" * 600 + b'"}',
-]
+ODD_BODIES = [b"", b"[" * 16_000, b'{"op":"estop","ref":"\xff"}', b"x" * 17_000, b'{"user":"\\ud800","password":"x"}']
 
 
 @pytest.mark.parametrize("body", ODD_BODIES, ids=lambda body: repr(body[:30]))
@@ -402,88 +325,23 @@ def test_passwords_cannot_be_guessed(broker: Broker, tmp_path: Path) -> None:
 # -- secrets
 
 
-def test_no_secret_leaves_the_server(
-    broker: Broker, tmp_path: Path, goob: RecordingRobot, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_no_secret_leaves_the_server(broker: Broker, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     hall = Hall(broker.port, tmp_path)
     settings = hall.served.settings
     secret = replace(settings.broker, username="sentinel-user", password="sentinel-broker-password")
     hall.served = Served(broker.port, login=True, people=settings.people, broker=secret)
     seen: list[bytes] = []
-    with hall, hall.client("admin") as client:
+    with hall, hall.client("admin") as client, hall.page("admin") as page:
         token = client.headers["cookie"].partition("=")[2]
-        paths = {*hall.routes(Route, "GET"), *(f"/static/{hall.served.version}/{name}" for name in static(hall))}
-        for path in paths:
+        for path in hall.routes(Route, "GET"):
             answer = client.get(path)
             seen += [answer.content, str(answer.headers).encode()]
-        for user, password in (("admin", PASSWORDS["admin"]), ("admin", "sentinel-guess"), ("", "")):
-            body = {"user": user, "password": password}
-            answer = client.post("/api/login", json=body, headers={"origin": hall.served.origin})
-            seen.append(answer.content)
-        with hall.page("admin") as page:
-            page.send("watch", ref=GOOB)
-            assert page.knows(GOOB)
-            assert until(lambda: page.value(GOOB, "web/flags"))
-            seen.append(repr((page.welcome, page.state)).encode())
+        for password in (PASSWORDS["admin"], "sentinel-guess"):
+            body = {"user": "admin", "password": password}
+            seen.append(client.post("/api/login", json=body, headers={"origin": hall.served.origin}).content)
+        seen.append(repr((page.welcome, page.state)).encode())
         audit = repr(hall.served.app.state.audit.read(1000)).encode()
         everything = b"\n".join([*seen, audit, repr(hall.served.settings).encode(), caplog.text.encode()])
-        assert everything.count(b"sentinel-broker-password") == 0
-        assert token.encode() not in everything
-        for password in (*PASSWORDS.values(), "sentinel-guess"):
-            assert password.encode() not in everything
+        secrets = ["sentinel-broker-password", token, *PASSWORDS.values(), "sentinel-guess"]
+        assert [secret for secret in secrets if secret.encode() in everything] == []
         assert str(tmp_path).encode() not in b"\n".join(seen)
-
-
-def static(hall: Hall) -> list[str]:
-    names = list(hall.served.app.state.static.files)
-    assert {"fleet.html", "robot.html", "login.html", "main.js"} <= set(names)
-    return names
-
-
-# -- connections that are opened and held
-
-
-@contextmanager
-def held_connections(port: int, number: int = cases(400, 1200)) -> Iterator[None]:
-    """So many at once from this machine, all silent, each opened again when it is closed."""
-    ending = threading.Event()
-
-    def refill(clients: list[socket.socket | None]) -> None:
-        while not ending.is_set():
-            for place, client in enumerate(clients):
-                with suppress(OSError):
-                    if client is not None and client.recv(1) != b"":
-                        continue
-                with suppress(OSError):
-                    clients[place] = socket.create_connection(("127.0.0.1", port), 1)
-                    clients[place].setblocking(False)  # type: ignore[union-attr]
-            ending.wait(0.2)
-        for client in clients:
-            if client is not None:
-                client.close()
-
-    with beside(lambda: refill([None] * number), ending):
-        yield
-
-
-def test_held_connections_keep_out_neither_a_person_nor_a_stop(
-    broker: Broker, tmp_path: Path, goob: RecordingRobot
-) -> None:
-    with Hall(broker.port, tmp_path) as hall, hall.page("driver") as page:
-        assert page.knows(GOOB)
-        assert page.ready()
-        with held_connections(hall.served.port):
-            time.sleep(1)  # all are open
-            answers = []
-            for number in range(10):
-                name = f"{number:016x}"
-                with suppress(httpx.TransportError), hall.client("viewer") as client:
-                    body = {"op": "estop", "ref": GOOB, "stop": name, "why": ""}
-                    headers = {"origin": hall.served.origin}
-                    answers.append(client.get("/healthz").status_code)
-                    answers.append(client.post("/api/estop", json=body, headers=headers).status_code)
-                time.sleep(0.2)
-            assert answers.count(202) >= 9, answers
-            page.send("estop", ref=GOOB, stop="00000000000000ff", why="x")
-            assert until(lambda: any("00000000000000ff" in str(one) for _, _, one in list(goob.received)), 5)
-            assert not page.closed

@@ -1,8 +1,9 @@
-"""``pebble drive`` in a real terminal, with a real broker and a robot that keeps control."""
+"""``pebble drive``: in a real terminal at a robot that keeps control, and its driver in virtual time."""
 
 from __future__ import annotations
 
 import itertools
+import json
 import signal
 import sys
 import time
@@ -11,10 +12,13 @@ from typing import Any
 
 import pytest
 
+from pebble.extensions.page.commands.terminal_driver import TerminalDriver
+from pebble.transports import Message
 from tests.commands.command_line import Run
+from tests.ext.operator.client.estop_robot import Robot, outgoing
 from tests.kit.played_robot import RecordingRobot
 from tests.kit.terminal import Terminal
-from tests.support import Broker, some, until
+from tests.support import Broker, until
 
 NUMBERS = itertools.count(1)
 BUSY_S = 0.35  # what a busy machine may add
@@ -95,31 +99,16 @@ def test_a_held_key_drives_and_its_release_stops(drive: Drive, lamp: RecordingRo
     assert until(lambda: owner.by == "")
 
 
-def signalled(number: signal.Signals) -> Callable[[Terminal], None]:
-    return lambda console: console.process.send_signal(number)
-
-
-def typed(key: bytes) -> Callable[[Terminal], None]:
-    def let_go_and_type(console: Terminal) -> None:
-        console.hold(b"")
-        console.type(key)
-
-    return let_go_and_type
-
-
 #: What ends a drive, and the exit status; None: the program goes on.
-ENDS = {
-    "SIGTERM": (signalled(signal.SIGTERM), 1),
-    "SIGHUP": (signalled(signal.SIGHUP), 1),
-    "Ctrl-D": (typed(b"\x04"), 0),
-    "Ctrl-Z": (typed(b"w\x1a"), 0),
-    "SIGQUIT": (signalled(signal.SIGQUIT), 1),
-    "space": (typed(b" "), None),
-    "SIGINT": (signalled(signal.SIGINT), 0),
+ENDS: dict[str, tuple[Callable[[Terminal], object], int | None]] = {
+    "SIGTERM": (lambda console: console.process.send_signal(signal.SIGTERM), 1),
+    "SIGQUIT": (lambda console: console.process.send_signal(signal.SIGQUIT), 1),
+    "Ctrl-D": (lambda console: (console.hold(b""), console.type(b"\x04")), 0),
+    "space": (lambda console: (console.hold(b""), console.type(b" ")), None),
 }
 
 
-@pytest.mark.parametrize("end", some(ENDS, 2))
+@pytest.mark.parametrize("end", ENDS)
 def test_what_ends_a_drive_stops_the_robot_at_once(drive: Drive, lamp: RecordingRobot, end: str) -> None:
     console, (happens, code) = drive(), ENDS[end]
     driving(console, lamp, b"\x1b[D")
@@ -131,18 +120,16 @@ def test_what_ends_a_drive_stops_the_robot_at_once(drive: Drive, lamp: Recording
     assert until(lambda: sent(lamp)[-3:] == [FINAL] * 3), lamp.drives()[-8:]
 
 
-@pytest.mark.parametrize("keys", some([b"\x1b\x1b", b"!"], 2))
-def test_an_emergency_stop_latches(drive: Drive, lamp: RecordingRobot, run: Run, url: str, keys: bytes) -> None:
+def test_an_emergency_stop_latches(drive: Drive, lamp: RecordingRobot, run: Run, url: str) -> None:
     console = drive()
     driving(console, lamp)
-    console.type(keys)
+    console.type(b"\x1b\x1b")
     assert until(lambda: lamp.latched, BUSY_S)
     assert rests(lamp, BUSY_S)
     assert console.sees("Stopped by ")
     stopped = time.monotonic()
     time.sleep(1.0)
     assert not any(moves(command) for command in lamp.drives(stopped))
-    assert console.process.poll() is None
     console.hold(b"")
     assert run("estop", "reset", lamp.id, "--url", url) == 0
     console.forget()
@@ -150,18 +137,152 @@ def test_an_emergency_stop_latches(drive: Drive, lamp: RecordingRobot, run: Run,
     driving(console, lamp)
 
 
-def test_an_emergency_stop_is_sent_on_after_the_terminal_has_ended(
-    drive: Drive, lamp: RecordingRobot, run: Run, url: str
-) -> None:
+def test_an_emergency_stop_is_sent_on_after_the_terminal_has_ended(drive: Drive, lamp: RecordingRobot) -> None:
     console = drive()
     console.type(b"!\x04")
     assert console.process.wait(10) == 0
     assert lamp.latched
     assert "NOT CONFIRMED" not in console.shown.rpartition("\n")[2]
-    assert run("estop", "reset", lamp.id, "--url", url) == 0, run.err
 
 
 def test_without_a_terminal_there_is_one_line(run: Run) -> None:
     assert run("drive", "minilamp", "--url", "mqtt://127.0.0.1") == 1
     assert run.err.startswith("pebble: driving by keys needs a terminal of Linux or macOS: use `pebble web`, ")
     assert run.err.count("\n") == 1
+
+
+# -- the driver alone
+
+
+GOOB = "pebble/robots/goob"
+DRIVE, ESTOP = f"{GOOB}/incoming/drive-values", f"{GOOB}/incoming/estop"
+WALL = 1_760_000_000.0
+TICK = 0.05
+
+
+class Cab:
+    """A driver at a terminal, and the robot, in virtual time."""
+
+    def __init__(self, *, heartbeat: bool = True, assume: bool = False, **more: Any) -> None:
+        self.robot = Robot(GOOB, "serial", **more)
+        self.driver = TerminalDriver(
+            GOOB, by="ann@desk", device="terminal", speed=0.6, turn=0.8, heartbeat=heartbeat, assume=assume
+        )
+        self.now, self.heartbeats = 0.0, heartbeat
+        self.problem = ""
+        self.sent: list[Message] = []
+
+    def receive(self, *messages: Message) -> None:
+        for message in messages:
+            self.driver.receive(message, self.now, WALL + self.now)
+
+    def run(self, seconds: float, key: str = "") -> list[Any]:
+        """Let time pass while ``key`` is held; return the drive commands."""
+        start = len(self.sent)
+        for tick in range(round(seconds / TICK)):
+            if self.heartbeats and tick % 5 == 0:
+                self.receive(outgoing(GOOB, "online", {"t": int(1000 * (WALL + self.now))}))
+            self.driver.press([key] if key else [], self.now)
+            self.sent += self.driver.tick(self.now, self.problem)
+            self.now = round(self.now + TICK, 6)
+        return [json.loads(message.payload) for message in self.sent[start:] if message.topic == DRIVE]
+
+    def moves(self, key: str = "w") -> bool:
+        """True if ``key``, pressed anew, moves the robot."""
+        self.run(0.5)
+        return any(drive["x"] or drive["z"] for drive in self.run(0.5, key))
+
+    def ready(self) -> Cab:
+        self.receive(self.robot.capabilities(), *(owner.state() for owner in self.robot.owners))
+        self.run(2.0)
+        assert self.driver.status().startswith("goob · ready")
+        return self
+
+
+@pytest.mark.parametrize(("key", "x", "z"), [("w", 0, 0.6), ("down", 0, -0.6), ("d", 0.8, 0), ("left", -0.8, 0)])
+def test_a_held_key_drives_until_04_s_after_its_last_repetition(key: str, x: float, z: float) -> None:
+    cab = Cab().ready()
+    commands = cab.run(1.0, key)
+    assert {(command["x"], command["z"], command["valid_ms"]) for command in commands} == {(x, z, 400)}
+    assert 15 <= len(commands) <= 20
+    after = cab.run(1.0)
+    moving = [command for command in after if command["x"] or command["z"]]
+    assert 6 <= len(moving) <= 8
+    assert after[len(moving) :] == [{"x": 0, "z": 0, "y": 0}]
+
+
+def test_a_board_that_never_says_what_it_can_do_is_driven_if_a_person_says_that_it_drives() -> None:
+    assert not Cab().moves()
+    cab = Cab(assume=True)
+    assert cab.run(4.0, "w") == []
+    cab.run(2.0)
+    assert cab.run(0.2, "w")[-1] == {"x": 0.0, "z": 0.6, "y": 0.0}
+    assert cab.run(2.0)[-3:] == [{"x": 0.0, "z": 0.0, "y": 0.0}] * 3
+    cab.receive(Message(DRIVE, b'{"z": 1}', retain=True))
+    assert not cab.moves()
+    assert "retained on its topic" in cab.driver.status()
+
+
+def test_no_wheel_is_faster_than_1() -> None:
+    cab = Cab().ready()
+    cab.driver.press(["w", "d"], cab.now)
+    command = cab.run(0.1)[0]
+    assert command["x"] + command["z"] == pytest.approx(1.0, abs=0.002)
+
+
+#: What speaks against driving, and what the status says.
+REASONS = [
+    ("problem", "no connection: it was lost"),
+    ("silent", "goob is silent"),
+    ("stopped", "Emergency stop"),
+]
+
+
+@pytest.mark.parametrize(("event", "words"), REASONS)
+def test_a_reason_ends_the_drive_and_the_keys_must_be_released(event: str, words: str) -> None:
+    cab = Cab().ready()
+    assert cab.run(0.5, "w")[-1]["z"] == 0.6
+    before, heartbeats = len(cab.sent), cab.heartbeats
+    cab.problem = "it was lost" if event == "problem" else ""
+    cab.heartbeats = event != "silent"
+    cab.driver.press(["!"] if event == "stopped" else [], cab.now)
+    commands = cab.run(3.0, "w")
+    assert words in cab.driver.status()
+    assert commands[-3:] == [{"x": 0, "z": 0, "y": 0, "valid_ms": 0}] * 3
+    assert any(message.topic == ESTOP for message in cab.sent[before:]) is (event == "stopped")
+    cab.problem, cab.heartbeats = "", heartbeats
+    cab.receive(*(owner.state() for owner in cab.robot.owners))
+    assert [command for command in cab.run(2.0, "w") if command["z"]] == []
+    assert cab.moves() is (event != "stopped")
+
+
+def test_keys_that_were_held_back_on_the_way_move_nothing() -> None:
+    cab = Cab().ready()
+    cab.driver.press(["w"] * 8, cab.now)
+    assert [command for command in cab.run(1.0) if command["z"]] == []
+    assert cab.moves()
+
+
+def test_a_process_that_stood_still_needs_a_new_key() -> None:
+    cab = Cab().ready()
+    cab.run(0.5, "w")
+    cab.now += 0.6
+    assert [command for command in cab.run(1.0, "w") if command["z"]] == []
+    assert "let go first" in cab.driver.status()
+    assert cab.moves()
+
+
+def test_the_status_names_a_layout_without_latin_letters_and_a_script_that_drives() -> None:
+    cab = Cab().ready()
+    cab.run(0.1, "ц")
+    assert "this keyboard types ц: W A S D need a Latin layout" in cab.driver.status()
+    assert cab.moves("up")
+    cab.receive(outgoing(GOOB, "autonomy-status", {"running": True, "timestamp": 1, "file": "x", "label": "Follow"}))
+    assert cab.driver.status().startswith("goob · goob drives itself: Follow · ")
+
+
+def test_who_leaves_sends_a_last_zero_and_nothing_more_than_twice_after_it() -> None:
+    cab = Cab().ready()
+    cab.run(0.5, "w")
+    cab.driver.end(cab.now, leave=True)
+    assert cab.run(1.0) == [{"x": 0, "z": 0, "y": 0, "valid_ms": 0}] * 3

@@ -3,71 +3,60 @@
 from __future__ import annotations
 
 import asyncio
-import itertools
 import json
-import struct
 from collections.abc import Callable, Coroutine
 from typing import Any, cast
 
 import httpx
 import pytest
-from websockets.sync.client import connect
 
 from pebble.errors import TransportError
 from pebble.extensions.operator.client.broker import Broker as BrokerOfPages
 from pebble.extensions.page.open_components import OpenComponents
 from pebble.extensions.page.robots import Interest, Robots
 from pebble.transports import Message, MqttSettings, QoS, create
+from tests.ext.boards import mcu_wire as wire
 from tests.ext.page.served import Page
+from tests.ext.page.states import described, sample
 from tests.kit.played_robot import RecordingRobot
 from tests.support import Broker, until
 
-NAMES = itertools.count(1)
 
-
-def lines(page: Page) -> list[Any]:
-    """The log lines that a page has received."""
-    return [line for message in list(page.logs) for line in message["lines"]]
+def lines(page: Page) -> list[str]:
+    """Return the log lines that a page has received."""
+    return [line["message"] for message in list(page.logs) for line in message["lines"]]
 
 
 def publish(broker: Broker, topic: str, payload: bytes, *, retain: bool = False) -> None:
-    transport = create("mqtt", "somewhere", MqttSettings(host="127.0.0.1", port=broker.port))
-    transport.open()
-    transport.publish(topic, payload, qos=QoS.DELIVERED, retain=retain)
-    assert until(lambda: transport.outgoing.waiting == 0)
-    transport.close()
+    with create("mqtt", "somewhere", MqttSettings(host="127.0.0.1", port=broker.port)) as transport:
+        transport.publish(topic, payload, qos=QoS.DELIVERED, retain=retain)
+        assert until(lambda: transport.outgoing.waiting == 0)
 
 
 # -- logs
 
 
-def test_a_page_that_reads_logs_receives_those_from_before_and_those_that_come(page, robot, broker) -> None:
+def test_a_page_that_reads_logs_receives_those_from_before_and_those_that_come(page, robot) -> None:
+    def logged(text: str) -> bool:
+        """Publish until the server receives it: it subscribes a moment after the page has opened the robot."""
+        robot.publish("logs", {"message": text})
+        robot.publish("status", {"value": text})
+        return page.value(robot.base, "status", "value") == text
+
     page.send("watch", ref=robot.base)
-    assert until(lambda: _logged(robot, page, "first"))
+    assert until(lambda: logged("first"))
     assert page.logs == []  # it has not asked
     page.send("read-logs", ref=robot.base, on=True)
     assert until(lambda: lines(page))
-    robot.publish("logs", {"t": 1, "level": "INFO", "service": "a", "message": "second"})
-    publish(broker, f"{robot.base}/outgoing/logs", b"plain text")
-    assert until(lambda: lines(page)[-1:] == [{"message": "plain text"}])
-    first = page.logs[0]
-    assert lines(page)[-2]["message"] == "second"
+    robot.publish("logs", {"message": "second"})
+    assert until(lambda: lines(page)[-1] == "second")
     page.send("read-logs", ref=robot.base, on=False)
-    robot.publish("logs", {"message": "unread"})
-    robot.publish("charging-level", {"value": 3.5})
-    assert until(lambda: page.value(robot.base, "charging-level") is not None)
-    assert lines(page)[-1] == {"message": "plain text"}
+    assert until(lambda: logged("unread"))
+    assert lines(page)[-1] == "second"
     seen = len(lines(page))
-    page.send("read-logs", ref=robot.base, on=True, origin=first["origin"], after=seen)
-    assert until(lambda: lines(page)[-1] == {"message": "unread"})
-    assert len(lines(page)) == seen + 1
-
-
-def _logged(robot: RecordingRobot, page: Page, text: str) -> bool:
-    """Publish until the server receives it: it subscribes a moment after the page has opened the robot."""
-    robot.publish("logs", {"message": text})
-    robot.publish("status", {"value": {"text": text}})
-    return page.value(robot.base, "status", "value") == {"text": text}
+    page.send("read-logs", ref=robot.base, on=True, origin=page.logs[0]["origin"], after=seen)
+    assert until(lambda: lines(page)[-1] == "unread")
+    assert lines(page)[:seen].count("unread") == 0
 
 
 # -- flags
@@ -77,15 +66,28 @@ def test_flags_are_those_of_the_broker(page, robot, broker) -> None:
     flags = lambda: page.value(robot.base, "web/flags")
     page.send("watch", ref=robot.base)
     assert until(flags)
-    assert flags() == {"remote_mirror": None, "mqtt_audio": None, "mqtt_video": None}
     page.send("flag", ref=robot.base, name="mqtt-video", on=True)
-    assert until(lambda: flags()["mqtt_video"] is True)
+    assert until(lambda: flags() == {"remote_mirror": None, "mqtt_audio": None, "mqtt_video": True})
     publish(broker, f"{robot.base}/incoming/flags/mqtt-audio", b'{"enabled": false}', retain=True)
     assert until(lambda: flags()["mqtt_audio"] is False)
     publish(broker, f"{robot.base}/incoming/flags/mqtt-video", b'"odd"')
     publish(broker, f"{robot.base}/incoming/flags/mqtt-audio", b"", retain=True)
-    assert until(lambda: flags()["mqtt_audio"] is None)
-    assert flags()["mqtt_video"] is True
+    assert until(lambda: flags() == {"remote_mirror": None, "mqtt_audio": None, "mqtt_video": True})
+
+
+# -- microcontrollers
+
+
+def test_what_an_mcu_publishes_under_an_alias_arrives(page: Page, robot: RecordingRobot) -> None:
+    page.send("watch", ref=robot.base)
+    robot.publish("mcu/lamp-1/describe", described(wire.LAMP), retain=True)
+    robot.publish("lights/lamp", sample("lamp-1", "lamp", {"level": 62.5}), retain=True)
+    assert until(lambda: page.value(robot.base, "lights/lamp", "value") == {"level": 62.5})
+    assert page.value(robot.base, "mcu/lamp-1/describe", "device_uid") == "lamp-1"
+    robot.publish("lights/other", {"value": 1}, retain=True)
+    robot.publish("mcu/lamp-1/glow", sample("lamp-1", "glow", {"lux": 1.5}))
+    assert until(lambda: page.value(robot.base, "mcu/lamp-1/glow", "value") == {"lux": 1.5})
+    assert page.value(robot.base, "lights/other") is None
 
 
 # -- opened and closed
@@ -166,62 +168,43 @@ async def capabilities_pass_no_channel_off_as_another() -> None:
     assert not {f"{rig.base}/outgoing/front-camera", f"{rig.base}/incoming/estop"} & rig.filters
 
 
-@pytest.mark.parametrize(
-    "story",
-    [opened_while_it_is_being_closed, no_component_leaves_nothing, capabilities_pass_no_channel_off_as_another],
+async def a_topic_that_is_refused_holds_back_no_other() -> None:
+    rig = Opened()
+    rig.refuses = f"{rig.base}/outgoing/sensors/imu"
+    rig.components.open(rig.base)
+    for _ in range(100):
+        await asyncio.sleep(0)
+    assert {f"{rig.base}/outgoing/logs", f"{rig.base}/incoming/flags/mqtt-video"} <= rig.filters
+    rig.refuses = ""
+    await asyncio.gather(*rig.tasks)
+    assert f"{rig.base}/outgoing/sensors/imu" in rig.filters
+
+
+STORIES = (
+    opened_while_it_is_being_closed,
+    no_component_leaves_nothing,
+    capabilities_pass_no_channel_off_as_another,
+    a_topic_that_is_refused_holds_back_no_other,
 )
+
+
+@pytest.mark.parametrize("story", STORIES)
 def test_components_that_are_opened_and_closed(story: Callable[[], Coroutine[Any, Any, None]]) -> None:
     asyncio.run(story())
-
-
-def test_one_topic_that_cannot_be_received_holds_back_no_other(caplog: pytest.LogCaptureFixture) -> None:
-    async def work() -> None:
-        rig = Opened()
-        rig.refuses = f"{rig.base}/outgoing/sensors/imu"
-        rig.components.open(rig.base)
-        for _ in range(100):
-            await asyncio.sleep(0)
-        assert {f"{rig.base}/outgoing/logs", f"{rig.base}/incoming/flags/mqtt-video"} <= rig.filters
-        assert [record.getMessage() for record in caplog.records] == [f"{rig.refuses} is not received: no"]
-        rig.refuses = ""
-        await asyncio.gather(*rig.tasks)
-        assert f"{rig.base}/outgoing/sensors/imu" in rig.filters
-
-    asyncio.run(work())
 
 
 # -- names
 
 
-def test_without_a_login_a_pages_name_counts_also_for_its_voice_and_for_a_stop_by_request(served, broker) -> None:
-    base = f"pebble/robots/rig{next(NAMES)}"
-    audio = {"available": True, "controls": True, "topic": f"{base}/outgoing/audio"}
-    url = f"ws://127.0.0.1:{served.port}/ws/sound?ref={base}&name=Alice&device=phone"
-    with (
-        RecordingRobot(broker.port, base, capabilities={"audio": audio, "drive": {"available": True}}),
-        Page(served, name="Alice \u202e", device="phone") as alice,
-        Page(served) as other,
-    ):
+def test_without_a_login_a_pages_name_counts_also_for_a_stop_by_request(served, robot) -> None:
+    with Page(served, name="Alice \u202e", device="phone") as alice, Page(served) as other:
         assert (alice.welcome["user"], other.welcome["user"]) == ("Alice ?", "local")
-        assert other.knows(base)
-        assert alice.knows(base)
-        with connect(url, origin=served.origin) as sound:
-            sound.send(struct.pack(">BII", 1, 1, 0) + bytes(640))
-            assert json.loads(sound.recv(timeout=3)) == {"talk": 1, "on": True, "why": ""}
-            assert until(lambda: other.value(base, "web/sound", "talker") == "Alice")
-        assert alice.take(base)
-        assert until(lambda: other.value(base, "web/driver", "by") == "Alice ?")
-        assert other.value(base, "web/driver", "device") == "phone"
-        alice.send("estop", ref=base, stop="00000000000000ff", why="test")
-        stop = {"op": "estop", "ref": base, "stop": "00112233445566aa"}
-        with httpx.Client(headers={"origin": served.origin}) as client:
-            assert client.post(f"{served.origin}/api/estop?name=Alice", json=stop).status_code == 202
+        assert alice.knows(robot.base)
+        alice.send("estop", ref=robot.base, stop="00000000000000ff", why="test")
+        stop = {"op": "estop", "ref": robot.base, "stop": "00112233445566aa"}
+        answer = httpx.post(f"{served.origin}/api/estop?name=Alice", json=stop, headers={"origin": served.origin})
+        assert answer.status_code == 202
+    expected = {("stop", "Alice ?", "phone"), ("stop", "Alice", "")}
     audit = served.app.state.audit
-    expected = {
-        ("talk", "Alice", "phone"),
-        ("take", "Alice ?", "phone"),
-        ("stop", "Alice ?", "phone"),
-        ("stop", "Alice", ""),
-    }
-    noted = lambda: {(one.what, one.user, one.device) for one in audit.read(20) if one.ref == base}
+    noted = lambda: {(one.what, one.user, one.device) for one in audit.read(20) if one.ref == robot.base}
     assert until(lambda: expected <= noted()), noted()

@@ -1,30 +1,39 @@
-"""The parts of the server together, without a broker."""
+"""The server's table of components, and what pages get of it; without a broker."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from pebble.contract import CAPABILITIES, codec
+from pebble.contract.payloads import Capabilities
 from pebble.extensions.fleet.audit import Audit
 from pebble.extensions.fleet.people import People
 from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.extensions.page import robots as robots_module
 from pebble.extensions.page.drive.driven_robot import Tab
-from pebble.extensions.page.robots import Interest, Robots
+from pebble.extensions.page.log_lines import MAX_BYTES, MAX_LINE_BYTES, MAX_LINES, PART_BYTES, LogLines, line_of
+from pebble.extensions.page.robots import MAX_ALIASES, Interest, Robots
 from pebble.extensions.page.server import Server
 from pebble.extensions.page.setting import WebSettings
 from pebble.transports import Message, MqttSettings
+from tests.ext.boards import mcu_wire as wire
+from tests.ext.page.states import described
 
 _CAPABILITIES = {"t": 1, "value": {"drive": {"available": True}, "estop": {"available": True, "owners": ["serial"]}}}
 
 
-def published(ref: str, metric: str, value: object, *, retain: bool = False) -> Message:
-    return Message(f"{ref}/outgoing/{metric}", json.dumps(value).encode(), retain=retain)
+def published(ref: str, metric: str, value: object) -> Message:
+    raw = value if isinstance(value, bytes) else json.dumps(value).encode()
+    return Message(f"{ref}/outgoing/{metric}", raw)
 
 
-GOOB, TOWER = "pebble/robots/goob", "pebble/robots/tower"
+GOOB = "pebble/robots/goob"
 
 
 @pytest.fixture
@@ -35,9 +44,13 @@ def server() -> Iterator[Server]:
     audit.close()
 
 
-@pytest.mark.parametrize("topic", ["pebble/robots/goob/incoming/\x01", "x" * 1100, "a" + "/b" * 250, "#", ""])
-def test_what_no_topic_may_be_called_is_refused_and_nothing_else(server: Server, topic: str) -> None:
-    assert server.broker.publish(topic, b"{}") is False
+def test_what_no_topic_may_be_called_is_refused(server: Server) -> None:
+    for topic in (f"{GOOB}/incoming/\x01", "x" * 1100, "a" + "/b" * 250, "#", ""):
+        assert server.broker.publish(topic, b"{}") is False
+
+
+def stop(server: Server, ref: str) -> None:
+    server.stops.press(ref, "a" * 16, by="", why="", now=1.0, known=[RobotView(GOOB)])
 
 
 #: What a page does with a robot, whether it gets a place that way, and whether it keeps one.
@@ -45,14 +58,8 @@ USES: dict[str, tuple[Callable[[Server], object], tuple[bool, bool]]] = {
     "nothing": (lambda _: None, (False, False)),
     "it is open": (lambda server: server.open_components.open(GOOB), (True, True)),
     "it is driven": (lambda server: setattr(server.drivers.robot(GOOB), "tab", Tab("", "ann", "")), (True, True)),
-    "it is stopped": (
-        lambda server: server.stops.press(GOOB, "a" * 16, by="", why="", now=1.0, known=[]),
-        (True, True),
-    ),
-    "all are stopped": (
-        lambda server: server.stops.press("", "a" * 16, by="", why="", now=1.0, known=[RobotView(GOOB)]),
-        (False, True),
-    ),
+    "it is stopped": (lambda server: stop(server, GOOB), (True, True)),
+    "all are stopped": (lambda server: stop(server, ""), (False, True)),
 }
 
 
@@ -68,7 +75,6 @@ def test_a_robot_keeps_its_place_while(
 @pytest.mark.parametrize(
     ("comes", "wanted", "kept", "stays"),
     [
-        ("first", False, False, False),
         ("first", False, True, True),
         ("first", True, True, True),
         ("last", False, False, False),
@@ -129,3 +135,201 @@ def test_what_does_not_fit_into_a_message_waits_behind_what_is_open(monkeypatch:
     assert parts[0][0] == refs[30]
     assert len(parts) > 3
     assert sorted(ref for part in parts for ref in part) == sorted(refs)
+
+
+def test_large_values_are_sent_one_at_a_time() -> None:
+    robots, interest = Robots(), Interest(lambda: None)
+    robots.join(interest)
+    for name in ("a", "b"):
+        topic = f"pebble/robots/{name}/outgoing/capabilities"
+        robots.receive(Message(topic, codec.encode(CAPABILITIES, Capabilities(t=1, value={"x": "y" * 20_000}))), 0.0)
+    robots.set_server_metric("", "web/broker", {"connected": True})
+
+    def taken(*, large: bool) -> tuple[set[str], bool]:
+        values, had = robots.take(interest, 1.0, large=large)
+        return {ref.rpartition("/")[2] for ref, metric, *_ in values if metric == "capabilities"}, had
+
+    assert taken(large=False) == (set(), False)
+    first, had = taken(large=True)
+    assert had
+    assert taken(large=False) == (set(), False)
+    assert (first | taken(large=True)[0], len(first)) == ({"a", "b"}, 1)
+    assert taken(large=True) == (set(), False)
+
+
+# -- what pages get of outlets, microcontrollers and cards
+
+
+DESCRIBE = "mcu/lamp-1/describe"
+
+
+def manifest(*channels: Any) -> dict[str, Any]:
+    interfaces = [{"name": f"i{n}", "dir": "out", "channel": channel} for n, channel in enumerate(channels)]
+    return described(wire.LAMP) | {"interfaces": interfaces}
+
+
+#: What is defined elsewhere, or cannot be a part of a topic.
+NO_ALIASES = [
+    "", 1, None, {"a": 1}, "front-camera", "logs", "estop/base", "estops", "control/x", "by/x", "web/estop", "web",
+    "mcu/other/lamp", "a/#", "a/+/b", "/a", "a//b", "$SYS", "a\0b", "a" * 65, "/".join(["a" * 30] * 8),
+]  # fmt: skip
+
+
+def test_only_a_free_channel_becomes_an_alias() -> None:
+    def aliases(channel: Any) -> list[str]:
+        robots = Robots()
+        robots.receive(published(GOOB, DESCRIBE, manifest(channel, channel)), 1.0)
+        return robots.aliases(GOOB)
+
+    assert [one for one in NO_ALIASES if aliases(one)] == []
+    # the first one is the contract's in the other direction only: nothing arrives there
+    assert [aliases(one) for one in ("drive-values", "a/b")] == [["drive-values"], ["a/b"]]
+
+
+def test_a_manifest_of_any_shape_is_read() -> None:
+    for payload in ([], {}, {"interfaces": 1}, {"interfaces": [1, None, {}, {"dir": "in", "channel": "a/b"}]}):
+        robots = Robots()
+        robots.receive(published(GOOB, DESCRIBE, payload), 1.0)
+        assert robots.aliases(GOOB) == []
+        assert robots.value(GOOB, DESCRIBE) is not None
+
+
+FIELD = {"name": "x", "type": "u8"}
+INTERFACE = {"name": "a", "dir": "out", "encoding": {"fields": [FIELD]}}
+BARE = {"model": "", "firmware_version": "", "interfaces": []}
+TAG = {"key": "tag", "type": "int", "min": 0}
+FORM = {"key": "tag", "label": "tag", "type": "int", "default": None, "arg": "", "min": 0}
+#: Metrics, what a robot publishes, and what pages get of it.
+SHOWN: list[tuple[str, Any, Any]] = [
+    ("soundboard-files", {"files": ["a.wav"], "more": 1}, {"files": ["a.wav"], "more": 1}),
+    ("soundboard-files", {"value": {"files": ["a.wav"]}}, {"files": ["a.wav"]}),
+    *[("soundboard-files", value, {}) for value in (7, {"files": ["a", 7]})],
+    ("soundboard-status", {"playing": True, "file": {"x": 1}}, {}),
+    *[("autonomy-status", value, {}) for value in ({"running": 1}, {"running": True, "dependencies": ["x"]})],
+    ("autonomy-status", {"running": True, "file": None}, {"running": True, "file": None}),
+    *[("autonomy-files", value, {}) for value in (None, {"files": {}})],
+    ("autonomy-files", {"files": [{"file": "a", "configs": [TAG, 7, {}]}, {"file": 7}, "b"]},
+     {"files": [{"file": "a", "configs": [FORM]}]}),
+    ("autonomy-files", {"files": [{"file": "a", "label": 7}, {"file": ""}]}, {"files": []}),
+    (DESCRIBE, 7, BARE),
+    (DESCRIBE, {"model": {}, "firmware_version": ["x"], "interfaces": [7, INTERFACE, {**INTERFACE, "dir": "up"}]},
+     {**BARE, "interfaces": [INTERFACE]}),
+    ("outlets/o1/status", {"value": {"on": True}, "label": "Lamp"}, {"value": {"on": True}, "label": "Lamp"}),
+    ("outlets/o1/status", {"value": {"on": "yes"}}, {}),
+    ("media-status", {"t": 1, "value": {"camera": {"running": True}}}, {"camera": {"running": True}}),
+    ("media-status", {"t": 1, "value": {"camera": {"running": True, "problem": 7}}}, {}),
+    ("neighbours", {"receives": ["x"]}, {}),
+    *[("capabilities", value, {}) for value in (7, {"t": 1, "value": 7})],
+    ("capabilities", {"t": 1, "value": {"drive": {}, "mine": 7}}, {"t": 1, "value": {"drive": {}, "mine": 7}}),
+    ("capabilities", {"value": {"lights": 7, "identity": {"name": 7}, "outlets": {"outlets": [1]}, "reboot": True}},
+     {"value": {"reboot": True}}),
+    ("status", 7, 7),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("metric", "payload", "expected"), SHOWN)
+def test_pages_get_what_their_cards_rely_on(metric: str, payload: Any, expected: Any) -> None:
+    robots = Robots()
+    robots.receive(published(GOOB, metric, payload), 1.0)
+    assert json.loads(bytes(robots.value(GOOB, metric) or b"null")) == expected
+
+
+def test_pages_get_a_value_without_the_bytes_around_it() -> None:
+    robots = Robots()
+    robots.receive(published(GOOB, "status", b'\xef\xbb\xbf{"t":1,"value":{}}\r\n\0'), 1.0)
+    assert bytes(robots.value(GOOB, "status") or b"") == b'{"t":1,"value":{}}'
+    robots.receive(published(GOOB, "status", b"\0"), 1.0)  # not even an empty payload
+    assert robots.value(GOOB, "status") is not None
+
+
+def test_there_is_an_end_to_aliases() -> None:
+    robots = Robots()
+    for device in range(4):
+        many = manifest(*(f"x/{device}-{n}" for n in range(100)))
+        robots.receive(published(GOOB, f"mcu/m{device}/describe", many), 1.0)
+    assert len(robots.aliases(GOOB)) == MAX_ALIASES
+
+
+def test_aliases_end_with_their_manifest() -> None:
+    robots = Robots()
+    interest = Interest(lambda: None)
+    robots.join(interest)
+    robots.watch(interest, GOOB)
+    robots.receive(published(GOOB, DESCRIBE, manifest("a/b")), 1.0)
+    assert [value[:2] for value in robots.take(interest, 2.0, large=False)[0]] == [(GOOB, DESCRIBE)]
+    robots.receive(published(GOOB, DESCRIBE, b""), 1.0)
+    assert robots.aliases(GOOB) == []
+    assert robots.take(interest, 3.0, large=False) == (((GOOB, DESCRIBE, None, 0.0),), False)
+
+
+# -- log lines
+
+
+def read(lines: LogLines, after: int = 0) -> list[tuple[int, list[object]]]:
+    """All runs behind this number, each with the number of its first line."""
+    found = []
+    while (run := lines.after(after)) is not None:
+        found.append((run.first, [json.loads(bytes(line))["message"] for line in run.lines]))
+        after = run.first + len(run.lines) - 1
+    return found
+
+
+def taken(*lines: bytes) -> LogLines:
+    made = LogLines()
+    for line in lines:
+        made.add(line)
+    return made
+
+
+def test_lines_are_numbered_from_1_sent_once_and_leave_a_gap_where_some_are_dropped() -> None:
+    lines = taken(b'{"message":"a"}', b'"b"', b'"' + b"x" * MAX_LINE_BYTES + b'"', b'"c"')
+    runs = [[(1, ["a", "b"]), (4, ["c"])], [(2, ["b"]), (4, ["c"])], [(4, ["c"])]]
+    assert [read(lines, after) for after in range(3)] == runs
+
+
+def test_a_page_that_is_too_slow_sees_from_where_there_are_lines() -> None:
+    runs = read(taken(*(str(number).encode() for number in range(MAX_LINES + 20))), 5)
+    assert (runs[0][0], sum(len(run) for _, run in runs)) == (21, MAX_LINES)
+
+
+def test_plain_text_becomes_a_string() -> None:
+    assert bytes(line_of(b"hello [x") or b"") == b'{"message":"hello [x"}'
+    assert json.loads(bytes(line_of(b"\xff\x00") or b"")) == {"message": "\ufffd\0"}
+    assert bytes(line_of(b'\xef\xbb\xbf{"t":1,"msg":"x"}\r\n\0') or b"") == b'{"message":"x","t":1}'
+    assert line_of(b"\x01" * (MAX_LINE_BYTES // 2)) is None  # six bytes each, as JSON
+
+
+@given(st.lists(st.binary(max_size=2000), max_size=40), st.integers(0, 50))
+def test_whatever_arrives_is_bounded_and_valid_json(payloads: list[bytes], after: int) -> None:
+    runs = read(taken(*payloads * 8), after)
+    sizes = [sum(len(json.dumps(line)) for line in run) for _, run in runs]
+    assert sum(sizes) <= 6 * MAX_BYTES  # Python escapes what msgspec does not
+    assert sum(len(run) for _, run in runs) <= MAX_LINES
+    numbers = [first + index for first, run in runs for index in range(len(run))]
+    assert numbers == sorted(set(numbers))
+    assert not numbers or (numbers[0] > after and numbers[-1] <= len(payloads) * 8)
+
+
+def test_a_message_to_a_page_is_short_but_has_a_line() -> None:
+    runs = read(taken(*[json.dumps("x" * 2000).encode()] * 30))
+    assert max(len(json.dumps(run)) for _, run in runs) <= PART_BYTES + 100
+    assert len(read(taken(json.dumps("x" * (MAX_LINE_BYTES - 10)).encode()))) == 1
+
+
+@pytest.mark.parametrize(
+    ("raw", "line"),
+    [
+        ({"t": 5, "level": "warn", "service": "imu", "message": "[imu] x"}, [5, "WARNING", "imu", "x"]),
+        ({"value": {"t": 5, "level": "ERROR", "msg": "x"}}, [5, "ERROR", "", "x"]),
+        ({"t": 7, "value": "x"}, [7, "", "", "x"]),
+        ({"timestamp": 2, "message": 3}, [2000, "", "", "3"]),
+        (None, [None, "", "", ""]),
+        ([1, {"a": 2}], [None, "", "", '[1,{"a":2}]']),
+        ({"t": "soon", "level": {}, "service": [], "message": {"a": 1}}, [None, "", "", '{"a":1}']),
+        ({"t": 1e300, "level": "constructor", "message": "x"}, [None, "CONSTRUCTOR", "", "x"]),
+        ({"message": "x" * 5000}, [None, "", "", "x" * 4000 + "…"]),
+    ],
+)
+def test_a_line_may_be_of_any_shape(raw: object, line: list[object]) -> None:
+    made = json.loads(bytes(line_of(json.dumps(raw).encode()) or b""))
+    assert [made.get("t"), made.get("level", ""), made.get("service", ""), made["message"]] == line

@@ -33,23 +33,16 @@ from pebble.transports.memory import MemoryHub, MemoryTransport
 REF = "pebble/robots/goob"
 CAPABILITIES = f"{REF}/outgoing/capabilities"
 CAMERA, SOUND, UPLINK = f"{REF}/outgoing/front-camera", f"{REF}/outgoing/audio", f"{REF}/incoming/audio-stream"
-VIDEO: dict[str, Any] = {
-    "available": True,
-    "controls": True,
-    "topic": CAMERA,
-    "command_topic": f"{REF}/incoming/front-camera",
-    "flag_topic": f"{REF}/incoming/flags/mqtt-video",
-    "encodings": ["json", "pbvd", "h264"],
-}
-AUDIO: dict[str, Any] = {
-    "available": True,
-    "controls": True,
-    "topic": SOUND,
-    "uplink_topic": UPLINK,
-    "command_topic": f"{REF}/incoming/audio",
-    "flag_topic": f"{REF}/incoming/flags/mqtt-audio",
-    "encodings": ["pcm", "opus"],
-}
+
+
+def _section(topic: str, metric: str, flag: str, *encodings: str) -> dict[str, Any]:
+    """Return the section of the capabilities about a medium."""
+    topics = {"command_topic": f"{REF}/incoming/{metric}", "flag_topic": f"{REF}/incoming/flags/{flag}"}
+    return {"available": True, "controls": True, "topic": topic, "encodings": [*encodings], **topics}
+
+
+VIDEO = _section(CAMERA, "front-camera", "mqtt-video", "json", "pbvd", "h264")
+AUDIO = _section(SOUND, "audio", "mqtt-audio", "pcm", "opus") | {"uplink_topic": UPLINK}
 EVERYTHING = frozenset({"h264", "pbvd", "json", "jpeg", "opus", "pcm"})
 RATE, PIECE = 16_000, 320
 
@@ -59,12 +52,11 @@ class MediaRobot(ABC):
 
     medium: ClassVar[Medium]
     section: ClassVar[dict[str, Any]]
-    best: ClassVar[str]  # the encoding that a page which plays everything gets
 
     def __init__(
         self, section: dict[str, Any] | None, period_s: float, default: str, transport: Transport | None
     ) -> None:
-        """``transport``: one that is open; without it on a network of its own, ``hub``."""
+        """Begin to send. ``transport``: an open one; without it on a network of its own, ``hub``."""
         given = self.section if section is None else section
         self.hub = MemoryHub()
         self.transport = transport or MemoryTransport("robot", self.hub).open()
@@ -72,9 +64,9 @@ class MediaRobot(ABC):
         self.published: list[Message] = []  # by others, to the robot
         self.sent: list[bytes] = []
         self.mute = False
-        self._period_s, self.default = period_s, given.get("encoding", default)
+        self._period_s, self._default = period_s, given.get("encoding", default)
         self._requested = self._raised = self._keyframe = False
-        self._encoding = self.default
+        self._encoding = self._default
         self._ending = threading.Event()
         self.transport.subscribe("#", self.receive, echo=False, direct=True)
         self.announce(given)
@@ -114,7 +106,7 @@ class MediaRobot(ABC):
         elif message.topic == self.request:
             request = json.loads(message.payload)
             self._requested = request["enabled"]
-            self._encoding = request.get("encoding") or self.default
+            self._encoding = request.get("encoding") or self._default
             self._keyframe = self._keyframe or request.get("keyframe", False)
 
     def _run(self) -> None:
@@ -140,15 +132,10 @@ class MediaRobot(ABC):
 class PictureRobot(MediaRobot):
     """Films a moving scene."""
 
-    medium, section, best = "video", VIDEO, "h264"
+    medium, section = "video", VIDEO
 
     def __init__(
-        self,
-        video: dict[str, Any] | None = None,
-        *,
-        fps: float = 15,
-        size: tuple[int, int] = (160, 120),
-        transport: Transport | None = None,
+        self, video: dict[str, Any] | None = None, *, fps: float = 15, size: Any = (160, 120), transport: Any = None
     ) -> None:
         self._fps, self._scene = fps, Scene(*size)
         self._picture = np.empty((size[1], size[0], 3), np.uint8)
@@ -166,7 +153,7 @@ class PictureRobot(MediaRobot):
 class SoundRobot(MediaRobot):
     """Speaks, and keeps what it hears."""
 
-    medium, section, best = "audio", AUDIO, "opus"
+    medium, section = "audio", AUDIO
 
     def __init__(self, audio: dict[str, Any] | None = None, *, transport: Transport | None = None) -> None:
         self.voice: list[Sound] = []
@@ -197,10 +184,10 @@ def capabilities(section: dict[str, Any], medium: Medium = "video") -> bytes:
 
 
 class Page:
-    """One page's socket, as the hubs see it. It acknowledges what it receives unless ``answer`` is None."""
+    """A page's socket, as the hubs see it. It acknowledges what it receives if it ``answers``."""
 
-    def __init__(self, answer: int | None = 0) -> None:
-        self.answer = answer
+    def __init__(self, *, answers: bool = True) -> None:
+        self.answers = answers
         self.received: list[bytes] = []
         self.talks: list[dict[str, Any]] = []
         self.closed: int | None = None
@@ -210,10 +197,10 @@ class Page:
         if self.closed is not None:
             raise WebSocketDisconnect(self.closed)
         self.received.append(data)
-        if self.answer is not None:
-            self.take(data, self.answer)
+        if self.answers:
+            self.take(data)
 
-    def take(self, data: bytes, answer: int) -> None:
+    def take(self, data: bytes) -> None:
         """Acknowledge what was received."""
 
     async def send_text(self, text: str) -> None:
@@ -234,17 +221,18 @@ class Page:
 
 
 class PicturePage(Page):
-    """``answer``: 0 drawn, 1 a key frame is wanted, 2 it cannot be decoded."""
+    """Looks, and draws everything."""
 
     @property
     def frames(self) -> list[tuple[int, int, bytes]]:
         """Number, kind and body of each."""
         return [(*struct.unpack_from(">IB", data), data[5:]) for data in self.received]
 
-    def take(self, data: bytes, answer: int) -> None:
-        self.acknowledge(struct.unpack_from(">I", data)[0], answer)
+    def take(self, data: bytes) -> None:
+        self.acknowledge(struct.unpack_from(">I", data)[0], 0)
 
     def acknowledge(self, seq: int, what: int) -> None:
+        """Acknowledge a picture. ``what``: 0 it is drawn, 1 a key frame is wanted."""
         self.send(struct.pack(">IB", seq, what))
 
     def direct(self) -> list[bytes]:
@@ -257,11 +245,8 @@ class PicturePage(Page):
 class SoundPage(Page):
     """Listens, and talks."""
 
-    def take(self, data: bytes, answer: int) -> None:
-        self.acknowledge(len(self.received))
-
-    def acknowledge(self, count: int) -> None:
-        self.send(struct.pack(">BI", 0, count))
+    def take(self, data: bytes) -> None:
+        self.send(struct.pack(">BI", 0, len(self.received)))
 
     def send_piece(self, talk: int, number: int, pcm: bytes) -> None:
         self.send(struct.pack(">BII", 1, talk, number) + pcm)
@@ -306,38 +291,26 @@ class Server:
         self.noted: list[tuple[str, str]] = []  # who talked
         self.media = MediaHub(self.broker, self.robots)
         self.sound = SoundHub(self.broker, self.robots, lambda ref, who, *_: self.noted.append((ref, who.user)))
-        self.views: list[tuple[float, Any]] = []
+        self.view: Any = None  # the newest state that pages are shown
         self._tasks: set[asyncio.Task[None]] = set()
         publish = self.robots.set_server_metric
 
         def record(ref: str, metric: str, value: Any) -> None:
-            self.views.append((time.monotonic(), value))
+            self.view = value
             publish(ref, metric, value)
 
         self.robots.set_server_metric = record  # type: ignore[method-assign]
 
-    @property
-    def view(self) -> Any:
-        return self.views[-1][1] if self.views else None
-
     def shows(self, state: str) -> bool:
         return self.view is not None and self.view.state == state
 
-    def open(
-        self,
-        page: Page,
-        can: frozenset[str] = EVERYTHING,
-        *,
-        user: str = "alice",
-        role: Role = Role.DRIVER,
-        ref: str = REF,
-    ) -> Any:
+    def open(self, page: Page, can: frozenset[str] = EVERYTHING, *, user: str = "alice") -> Any:
         """Let the page look or listen; returns it."""
         socket = cast(WebSocket, page)
         if isinstance(page, SoundPage):
-            serving = self.sound.serve(socket, ref, can, Session(user, user, role))
+            serving = self.sound.serve(socket, REF, can, Session(user, user, Role.DRIVER))
         else:
-            serving = self.media.serve(socket, ref, can)
+            serving = self.media.serve(socket, REF, can)
         self._tasks.add(asyncio.create_task(serving))
         return page
 

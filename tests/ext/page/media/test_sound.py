@@ -36,14 +36,6 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
 # -- listening
 
 
-async def test_a_page_that_cannot_play_what_comes_gets_a_reason() -> None:
-    robot = SoundRobot({**AUDIO, "encodings": ["opus"], "encoding": "opus"})
-    async with serving(robot) as server:
-        page = server.open(SoundPage(), PLAIN)
-        await until(lambda: server.view and server.view.why == "1 of 1 browsers cannot play opus")
-        assert page.received == []
-
-
 def test_the_queue_of_a_slow_page_is_bounded_and_its_oldest_is_dropped() -> None:
     queue = SoundQueue()
     packets = [bytes([number]) * 100 for number in range(200)]
@@ -64,28 +56,29 @@ def test_the_queue_of_a_slow_page_is_bounded_and_its_oldest_is_dropped() -> None
     assert queue.take() is None, "larger than everything that may wait"
 
 
-async def test_a_page_that_acknowledges_nothing_gets_a_window_and_delays_no_other(
-    robot: SoundRobot, server: Server
-) -> None:
-    slow, fast = server.open(SoundPage(None)), server.open(SoundPage())
-    await until(lambda: len(fast.received) > WINDOW + 30)
+async def test_a_page_that_acknowledges_nothing_gets_a_window_and_delays_no_other(server: Server) -> None:
+    slow, fast = server.open(SoundPage(answers=False)), server.open(SoundPage())
+    await until(lambda: len(fast.received) > WINDOW + 5)
     assert len(slow.received) == WINDOW
-    slow.acknowledge(WINDOW)
-    await until(lambda: len(slow.received) > WINDOW)
-    newest = [Sound.unpack(page.received[-1]).sequence for page in (slow, fast)]
-    assert newest[1] - newest[0] <= MAX_PACKETS + 2
 
 
 async def test_what_is_no_sound_is_not_passed_on(robot: SoundRobot, server: Server) -> None:
     page = server.open(SoundPage())
     await until(lambda: page.received)
-    bad = [b"", b"PBAT", b"{}", Sound(9, 1, 16000, 1, 1, 1, b"xx").pack(), bytes(300_000)]
     big = Sound(1, 1, 16000, 320, 1, 1, bytes(300_000)).pack()
-    for payload in (*bad, big):
+    bad = {b"", b"PBAT", Sound(9, 1, 16000, 1, 1, 1, b"xx").pack(), big}
+    for payload in bad:
         robot.send(payload)
     count = len(page.received)
     await until(lambda: len(page.received) > count + 5)
-    assert not set(page.received) & {*bad, big}
+    assert not set(page.received) & bad
+
+
+async def test_a_page_that_sends_what_is_not_understood_is_closed(server: Server) -> None:
+    for message in (b"", b"\x07\0\0\0\1", b"\1" * 50, bytes(2000)):
+        page = server.open(SoundPage())
+        page.send(message)
+        await until(lambda page=page: page.closed is not None)
 
 
 # -- talking
@@ -104,18 +97,15 @@ async def test_no_voice_takes_the_room_of_commands_on_a_thin_link(robot: SoundRo
 @pytest.mark.usefixtures("patient")
 async def test_a_voice_reaches_the_robot_which_is_asked_to_play_it(robot: SoundRobot, server: Server) -> None:
     page = server.open(SoundPage(), NOTHING)
-    sent = await page.speak(1, 50)
-    await until(lambda: len(robot.voice) == 50)
+    sent = await page.speak(1, 20)
+    await until(lambda: len(robot.voice) == 20)
     assert b"".join(packet.body for packet in robot.voice) == sent
     assert {(one.codec, one.channels, one.rate, one.samples) for one in robot.voice} == {(1, 1, 16000, 320)}
     assert all(b.sequence == a.sequence + 1 for a, b in pairwise(robot.voice))
     assert all(abs(one.captured_ms - 1000 * time.time()) < 10_000 for one in robot.voice)
-    assert robot.flags == [True]
-    assert robot.encodings == ["opus"]
-    assert page.received == []  # it only talks
-    assert page.talks == [{"talk": 1, "on": True, "why": ""}]
-    assert server.view.talker == "alice"
-    assert server.view.listeners == 0
+    assert (robot.flags, robot.encodings) == ([True], ["opus"])
+    assert (page.received, page.talks) == ([], [{"talk": 1, "on": True, "why": ""}]), "it only talks"
+    await until(lambda: (server.view.talker, server.view.listeners) == ("alice", 0))
     assert server.noted == [(REF, "alice")]
     page.end(1)
     await until(lambda: server.view.talker == "")
@@ -126,7 +116,7 @@ async def test_a_voice_reaches_the_robot_which_is_asked_to_play_it(robot: SoundR
 @pytest.mark.usefixtures("patient")
 async def test_a_second_talker_is_refused_until_the_first_one_is_done(robot: SoundRobot, server: Server) -> None:
     bob, eve = server.open(SoundPage(), user="bob"), server.open(SoundPage(), user="eve")
-    talking = asyncio.create_task(bob.speak(1, 40))
+    talking = asyncio.create_task(bob.speak(1, 25))
     await until(lambda: server.view and server.view.talker == "bob")
     await eve.speak(1, 5)
     await until(lambda: eve.talks)
@@ -135,12 +125,10 @@ async def test_a_second_talker_is_refused_until_the_first_one_is_done(robot: Sou
     bob.end(1)
     eve.send_piece(1, 6, bytes(PIECE_BYTES))  # the refused one does not begin now
     await until(lambda: server.view.talker == "")
-    await until(lambda: len(robot.voice) == 40)
+    await until(lambda: len(robot.voice) == 25)
     assert b"".join(packet.body for packet in robot.voice) == sent
     await eve.speak(2, 5)
     await until(lambda: server.view.talker == "eve")
-    numbers = [packet.sequence for packet in robot.voice]
-    assert all(b > a for a, b in pairwise(numbers))
     assert server.noted == [(REF, "bob"), (REF, "eve")]
 
 
@@ -152,10 +140,8 @@ async def test_a_talk_ends_with_its_socket_and_after_a_second_without_sound(
     await until(lambda: bob.talks[-1:] == [{"talk": 1, "on": False, "why": "No sound came in time for 1 s"}])
     await until(lambda: server.view.talker == "")
     monkeypatch.setattr("pebble.extensions.page.media.talk.SILENT_S", 60.0)
-    bob.send_piece(1, 3, bytes(PIECE_BYTES))
     await bob.speak(2, 3)
     await until(lambda: server.view.talker == "bob")
-    assert [one["on"] for one in bob.talks] == [True, False, True]
     bob.leave()
     await until(lambda: server.view.talker == "")
     await eve.speak(1, 3)
@@ -167,7 +153,6 @@ async def test_the_voice_goes_to_the_robots_own_topic_only() -> None:
     for named, topic in [
         (f"{REF}/incoming/voice", f"{REF}/incoming/voice"),
         ("pebble/robots/victim/incoming/audio-stream", UPLINK),
-        (f"{REF}/incoming/drive-values", UPLINK),
     ]:
         robot = SoundRobot({**AUDIO, "uplink_topic": named})
         async with serving(robot) as server:
