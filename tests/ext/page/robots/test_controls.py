@@ -38,6 +38,17 @@ def test_the_space_bar_ends_the_gesture_and_latches_nothing(at_lamp: Console, wi
     assert at_lamp.press_anew()
 
 
+def _in_help(robot: Console) -> None:
+    """It ends a gesture, moves nothing, and leaves STOP in reach."""
+    robot.page.keyboard.press("?")
+    assert robot.rests()
+    robot.let_go()
+    robot.down("KeyW")
+    assert robot.stays_at_rest()
+    robot.test("stop-one").click()
+    robot.page.keyboard.press("?")
+
+
 def _touch(element: Locator) -> None:
     element.hover()
     element.page.mouse.down()
@@ -45,6 +56,8 @@ def _touch(element: Locator) -> None:
 
 STOPS: dict[str, Callable[[Console], None]] = {
     "Ctrl+Space": lambda robot: robot.page.keyboard.press("Control+Space"),
+    "STOP": lambda robot: robot.test("stop-one").click(),
+    "STOP beside the help": lambda robot: _in_help(robot),
     "STOP, as soon as it is touched": lambda robot: _touch(robot.test("stop-one")),
 }
 
@@ -126,6 +139,24 @@ def test_the_fleet_stops_robots(browser: Browser, stage: Stage, wire: Wire) -> N
         fleet.test("card-minilamp").click(position={"x": 4, "y": 4})  # the whole card is the link, but for its Stop
         assert fleet.until("window.pebble.driver.ref === 'pebble/robots/minilamp'", 2)
         assert fleet.complaints() == []
+
+
+# -- without a mouse
+
+
+@pytest.mark.page
+def test_the_tab_key_reaches_every_control(at_lamp: Console) -> None:
+    at_lamp.page.evaluate("document.activeElement.blur()")
+    focusable = "a[href], button:enabled, input:enabled, select:enabled, summary, [tabindex='0']"
+    count = at_lamp.page.evaluate(
+        "(all) => [...document.querySelectorAll(all)].filter((one) => one.checkVisibility()).length", focusable
+    )
+    at_lamp.page.evaluate("window.reached = new Set()")
+    for _ in range(count + 2):
+        at_lamp.page.keyboard.press("Tab")
+        at_lamp.page.evaluate("window.reached.add(document.activeElement)")
+    assert at_lamp.page.evaluate("window.reached.delete(document.body) || true")
+    assert at_lamp.page.evaluate("window.reached.size") == count
 
 
 def test_a_screen_that_only_watches_sends_nothing_but_stops(browser: Browser, server: CannedServer) -> None:
