@@ -117,7 +117,7 @@ def typed_alone(line: str, folder: Path) -> str:
 def typed(line: str, folder: Path) -> Iterator[None]:
     """A program that runs until it is ended."""
     with (folder / "simulation.log").open("ab") as log:
-        process = Child(python("pebble.cli", *shlex.split(line)[1:]), cwd=folder, stdout=log, stderr=log)
+        process = Child(python("pebble.cli", *words(line)), cwd=folder, stdout=log, stderr=log)
     try:
         yield
     finally:
