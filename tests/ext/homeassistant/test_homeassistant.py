@@ -85,6 +85,7 @@ def test_each_robot_has_a_valid_message_by_which_nothing_moves(robot: str, unit:
     assert len(raw) <= 8000
     message = json.loads(raw)
     assert (message.keys(), message["dev"].keys()) == ({"dev", "o", "cmps"}, {"ids", "name", "mf", "mdl", "sw"})
+    assert all(message["dev"].values())
     components = message["cmps"]
     assert len(components) <= 24
     for key, part in components.items():

@@ -65,6 +65,7 @@ def test_the_brokers_password_comes_from_a_file_or_the_environment(tmp_path: Pat
         private = private_files(one, C6, ssid="Lab", wifi_password="")
         assert private.settings["mqtt"]["password"] == password
         assert password not in private.shown() + repr(private)
+        assert '"password": "***"' in private.shown()
         assert password in private.text()
 
 

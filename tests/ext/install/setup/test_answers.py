@@ -47,6 +47,7 @@ def test_a_missing_answer_is_named_by_its_key(
         ({"id": "go/ob"}, "id: must be a topic level"),
         ({"id": "page"}, "id: 'page' is an account of the robot's own broker already"),
         ({"protocol": "morse"}, "protocol: 'morse' is none of goob_base_v1"),
+        ({"broker": "mqtt://broker.lab"}, "broker: write HOST or HOST:PORT"),
         ({"broker": "ann:secret-1@broker.lab"}, "broker: write HOST or HOST:PORT; user and password have keys"),
         ({"broker": "none"}, "page: a page needs a broker"),
         ({"broker_ca": "/etc/passwd", "broker": "127.0.0.1"}, "broker_ca: /etc/passwd holds no certificate"),
