@@ -32,10 +32,6 @@ def recorded(folder: Path) -> Path:
     return path
 
 
-def test_a_robot_without_a_recorder_is_not_asked(tmp_path: Path) -> None:
-    assert findings(tmp_path, enabled=False) == []
-
-
 def test_one_that_has_not_recorded_and_one_that_does_not_run(tmp_path: Path) -> None:
     (finding,) = findings(tmp_path / "none")
     assert (finding.state, "has not recorded anything" in finding.text) == (State.OK, True)
@@ -57,12 +53,6 @@ def test_one_that_runs(tmp_path: Path, status: dict[str, Any], state: State, tex
         (tmp_path / "recorder.json").write_text(json.dumps({"at": time.time(), "messages": 7, **status}))
         finding = findings(tmp_path)[0]
     assert (finding.state, text in finding.text) == (state, True)
-
-
-def test_without_the_package_it_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pebble.services.recorder.checks.find_spec", lambda _: None)
-    (finding,) = findings(tmp_path)
-    assert (finding.state, finding.fix) == (State.FAILED, 'pip install "pebble-robot[record]"')
 
 
 @pytest.mark.parametrize(

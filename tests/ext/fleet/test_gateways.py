@@ -1,106 +1,93 @@
-"""A gateway that is killed and hangs, while a robot is driven and stopped; it, hub and broker are processes."""
+"""Gateways as processes: two of one robot, the first of which is killed; and one of a board, which goob drives.
+
+The board has its real firmware, and goob its real `neighbours` and no wheels.
+"""
 
 from __future__ import annotations
 
 import itertools
 import json
-import os
-import signal
-import threading
+import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
-import msgspec
 import pytest
 
 from pebble.contract import CAPABILITIES, DRIVE, ESTOP, ONLINE
-from pebble.transports import Message, MqttSettings, QoS, ZenohSettings, create
-from tests.support import Broker, free_port, further, until
+from pebble.extensions.scripts.script import Robot
+from pebble.transports import Message, MqttSettings, QoS, Transport, ZenohSettings, create
+from pebble.transports.memory import MemoryTransport
+from tests.ext.neighbours.test_service import One
+from tests.firmware.wireless_rig import Robots
+from tests.support import Broker, free_port, until
 from tests.transports.forked import Forked
+from tests.transports.zenoh_net import HubProcess
 
 pytestmark = pytest.mark.alone
-FAULT_S, SECOND_S = 2.0, 10.0
-BACK_S, STOP_S = 6.0, 1.0
-COMMANDS_HZ, HEARTBEAT_EACH = 40, 10  # of the commands each tenth comes with a heartbeat
+SECOND_S, BACK_S, STOP_S = 10.0, 6.0, 1.0
 ROBOT = "pebble/robots/r0"
 
 
-class Hall:
-    """A robot at a hub, which an operator at a broker drives all the time; ``received``: numbers of its commands."""
+class Gateways:
+    """A hub, a broker of operators and a client there; gateways are started."""
 
     def __init__(self, folder: Path, stack: ExitStack) -> None:
         self._folder, self._stack = folder, stack
-        self.broker = Broker(folder, "max_queued_messages 20000")
+        self.broker = Broker(folder)
         stack.callback(self.broker.kill)
-        self.hub_port = free_port()
-        endpoint = (f"tcp/127.0.0.1:{self.hub_port}",)
-        settings = ZenohSettings(run_dir=folder / "hub", listen=endpoint)
-        hub = Forked("pebble.extensions.lab.rig.hub", [msgspec.json.encode(settings, enc_hook=str).decode()])
-        stack.callback(hub.kill)
-        at_hub = ZenohSettings(run_dir=folder / "r0", connect=endpoint, client=True)
-        self.robot = stack.enter_context(create("zenoh", "r0", at_hub))
-        self.sent: dict[int, float] = {}
-        self.received: list[tuple[int, float]] = []
-        self.stops: list[float] = []
-        self.robot.publish(CAPABILITIES.topic(ROBOT), b"{}", qos=QoS.DELIVERED, retain=True)
-        self.robot.subscribe(DRIVE.topic(ROBOT), self._on_drive, direct=True)
-        self.robot.subscribe(ESTOP.topic(ROBOT), lambda _stop: self.stops.append(time.monotonic()), direct=True)
+        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
+        hub = HubProcess(folder / "hub")
+        hub.settings = ZenohSettings(run_dir=folder / "hub", listen=(self.endpoint,))
+        stack.callback(hub.start().kill)
         operator = MqttSettings(host="127.0.0.1", port=self.broker.port)
         self.operator = stack.enter_context(create("mqtt", "operator", operator))
-        self._ending = threading.Event()
-        self.gateway = self.start("gate-1")
-        thread = threading.Thread(target=self._drive, daemon=True)
-        thread.start()
-        stack.callback(thread.join)
-        stack.callback(self._ending.set)
-        self.wait_until_carried()
 
-    def start(self, name: str) -> Forked:
-        """Start a gateway."""
+    def start(self, name: str, **sides: object) -> Forked:
+        """Start a gateway to the operators' broker."""
         file = self._folder / f"{name}.json"
-        sides = {
-            "hub": {"connect": [f"tcp/127.0.0.1:{self.hub_port}"]},
-            "mqtt": {"host": "127.0.0.1", "port": self.broker.port},
-        }
-        file.write_text(json.dumps({"id": name, **sides}))
+        file.write_text(json.dumps({"id": name, "mqtt": {"host": "127.0.0.1", "port": self.broker.port}, **sides}))
         process = Forked("tests.ext.fleet.gateway_process", str(file))
         self._stack.callback(process.wait, 10)
         self._stack.callback(process.kill)
         return process
 
-    def driven(self, since: float) -> bool:
-        """Return True if the robot has had a command that was sent after ``since``."""
-        return bool(self.received) and self.sent[self.received[-1][0]] > since
+    def client(self, name: str) -> Transport:
+        """Return a client of the hub."""
+        at_hub = ZenohSettings(run_dir=self._folder / name, connect=(self.endpoint,), client=True, lease_ms=500)
+        return create("zenoh", name, at_hub)
 
-    def wait_until_carried(self) -> None:
-        """Wait until the robot is driven without a break: after a start, or a fault."""
-        now = time.monotonic()
-        assert until(lambda: self.driven(now + 2.5), 60), len(self.received)
 
-    def wrong(self) -> int:
-        """Count the commands that came twice, after a newer one, or older than 1 s."""
-        late = sum(at - self.sent[number] > 1 for number, at in self.received)
-        return late + sum(later[0] <= earlier[0] for earlier, later in itertools.pairwise(self.received))
+class Hall(Gateways):
+    """A robot at the hub; ``received``: numbers of the commands that it got."""
 
-    def _drive(self) -> None:
-        """Send commands and heartbeats by one schedule: what is late is late for all."""
-        due = time.monotonic()
-        for number in itertools.count(1):
-            if self._ending.wait(max(0.0, due - time.monotonic())):
-                return
-            due += 1 / COMMANDS_HZ
-            command = json.dumps({"x": 0.5, "z": 0.0, "n": number}).encode()
-            self.sent[number] = time.monotonic()
-            self.operator.publish(DRIVE.topic(ROBOT), command, qos=QoS.DELIVERED)
-            if number % HEARTBEAT_EACH == 0:
-                heartbeat = json.dumps({"t": int(time.time() * 1000)}).encode()
-                self.robot.publish(ONLINE.topic(ROBOT), heartbeat, qos=QoS.DELIVERED, retain=True)
+    def __init__(self, folder: Path, stack: ExitStack) -> None:
+        super().__init__(folder, stack)
+        self._number = 0
+        self.robot = stack.enter_context(self.client("r0"))
+        self.received: list[int] = []
+        self.stops: list[float] = []
+        self.robot.publish(CAPABILITIES.topic(ROBOT), b"{}", qos=QoS.DELIVERED, retain=True)
+        self.robot.subscribe(DRIVE.topic(ROBOT), self._on_drive, direct=True)
+        self.robot.subscribe(ESTOP.topic(ROBOT), lambda _stop: self.stops.append(time.monotonic()), direct=True)
+        self.gateway = self.gate("gate-1")
+
+    def gate(self, name: str) -> Forked:
+        return self.start(name, hub={"connect": [self.endpoint]})
+
+    def drives(self) -> bool:
+        """Send a heartbeat and a command; True if the robot gets that."""
+        self._number += 1
+        heartbeat = json.dumps({"t": int(time.time() * 1000)}).encode()
+        self.robot.publish(ONLINE.topic(ROBOT), heartbeat, qos=QoS.DELIVERED, retain=True)
+        command = json.dumps({"x": 0.5, "z": 0.0, "n": self._number}).encode()
+        self.operator.publish(DRIVE.topic(ROBOT), command, qos=QoS.DELIVERED)
+        return until(lambda: self._number in self.received, 0.25)
 
     def _on_drive(self, message: Message) -> None:
         if message.payload.strip():  # else a probe for cycles
-            self.received.append((json.loads(message.payload)["n"], time.monotonic()))
+            self.received.append(json.loads(message.payload)["n"])
 
 
 @pytest.fixture
@@ -109,49 +96,94 @@ def hall(tmp_path: Path) -> Iterator[Hall]:
         yield Hall(tmp_path, stack)
 
 
-def kill(hall: Hall) -> None:
+def test_a_second_one_does_not_start_and_takes_over_where_it_is_tried_again(hall: Hall) -> None:
+    """As systemd does."""
+    assert until(hall.drives, 60), hall.gateway.printed
+    second = hall.gate("gate-2")
+    assert until(lambda: hall.drives() and second.poll() == 1, SECOND_S)
+    assert f"gateway gate-2 does not start: gate-1 carries {ROBOT}" in second.printed
     hall.gateway.kill()
     hall.gateway.wait(10)
-
-
-def start_again(hall: Hall) -> None:
-    hall.gateway = hall.start("gate-1")
-
-
-FAULTS: dict[str, tuple[Callable[[Hall], None], Callable[[Hall], None]]] = {
-    "kill": (kill, start_again),
-    "hang": (
-        lambda hall: os.kill(hall.gateway.pid, signal.SIGSTOP),
-        lambda hall: os.kill(hall.gateway.pid, signal.SIGCONT),
-    ),
-}
-
-
-@pytest.mark.parametrize("fault", ["kill", further("hang")])
-def test_after_a_fault_its_robot_is_driven_and_stopped_again(hall: Hall, fault: str) -> None:
-    begin, end = FAULTS[fault]
-    begin(hall)
-    time.sleep(FAULT_S)
-    end(hall)
-    mended = time.monotonic()
-    assert until(lambda: hall.driven(mended), 30)
-    assert time.monotonic() - mended <= BACK_S
+    began = time.monotonic()
+    hall.gate("gate-2")
+    assert until(hall.drives, 30)
+    assert time.monotonic() - began <= BACK_S
     stopped = time.monotonic()
     hall.operator.publish(ESTOP.topic(ROBOT), b'{"stop": "0123456789abcdef"}', qos=QoS.DELIVERED, urgent=True)
     assert until(lambda: hall.stops, 10)
     assert hall.stops[0] - stopped <= STOP_S
-    assert hall.wrong() == 0
+    again = hall.gate("gate-1")
+    assert until(lambda: hall.drives() and again.poll() == 1, SECOND_S)
+    assert hall.received == sorted(set(hall.received)), "none came twice, or after a newer one"
 
 
-def test_a_second_one_does_not_start_and_takes_over_where_it_is_tried_again(hall: Hall) -> None:
-    """As systemd does."""
-    second = hall.start("gate-2")
-    assert second.wait(SECOND_S) == 1
-    assert f"gateway gate-2 does not start: gate-1 carries {ROBOT}" in second.printed
-    assert hall.wrong() == 0
-    kill(hall)
-    began = time.monotonic()
-    hall.start("gate-2")
-    assert until(lambda: hall.driven(began), SECOND_S)
-    assert hall.start("gate-1").wait(SECOND_S) == 1
-    assert hall.wrong() == 0
+LAMP = "pebble/robots/minilamp"
+GRANT = {"shares": [ONLINE.metric], "commanded": {"goob": [DRIVE.metric]}}
+_RUNS = itertools.count(7)  # the gateway's state has each that has begun, as long as this process
+
+
+class Lan(Gateways):
+    """The broker of a LAN with its board, and a gateway."""
+
+    def __init__(self, folder: Path, stack: ExitStack) -> None:
+        super().__init__(folder, stack)
+        near = Broker(folder)
+        stack.callback(near.kill)
+        neighbours = {LAMP: {"lan": {"connect": [self.endpoint]}, **GRANT}}
+        self.gateway = self.start("gate-1", boards={"host": "127.0.0.1", "port": near.port}, neighbours=neighbours)
+        self.board = stack.enter_context(Robots("127.0.0.1", near.port, kinds=("minilamp",)))
+        client = self.client("goob-lan")
+        self.goob = One(folder / "goob", client, "goob", stack, listens={"minilamp": [ONLINE.metric]})
+        self.received: list[Message] = []
+        self.operator.subscribe(f"{LAMP}/outgoing/#", self.received.append, direct=True)
+
+    def script(self) -> Robot:
+        """A new start of a script of goob's."""
+        run = next(_RUNS)
+        robot = Robot(self.goob.config, MemoryTransport(f"script-{run}", self.goob.hub).open(), lambda _above: run)
+        self._stack.callback(robot.close)
+        assert until(lambda: robot.neighbour("minilamp").online, 20)
+        return robot
+
+    def drives(self, robot: Robot, seconds: float) -> bool:
+        """Let it drive the board for so long; whether its motors ran."""
+        began = time.monotonic()
+        while time.monotonic() < began + seconds:
+            robot.neighbour("minilamp").drive(z=0.4)
+            time.sleep(0.05)
+        return any(at > began and any(motors) for at, motors in list(self.board.moves["minilamp"]))
+
+    def send(self, topic: str, payload: dict[str, object]) -> None:
+        self.operator.publish(topic, json.dumps(payload).encode(), qos=QoS.DELIVERED)
+
+    def newest(self, metric: str) -> dict[str, object]:
+        found = [one.payload for one in list(self.received) if one.topic == f"{LAMP}/outgoing/{metric}"]
+        return json.loads(found[-1]) if found else {}
+
+
+@pytest.fixture
+def lan() -> Iterator[Lan]:
+    with tempfile.TemporaryDirectory(prefix="pbl") as folder, ExitStack() as stack:
+        made = Lan(Path(folder), stack)
+        made.board.wait_online()
+        topics = (ONLINE.topic(LAMP), CAPABILITIES.topic(LAMP), f"{LAMP}/outgoing/neighbours")
+        assert until(lambda: {*topics} <= {one.topic for one in list(made.received)}, 20), made.gateway.printed
+        yield made
+
+
+def test_a_board_is_driven_by_a_neighbour_until_a_person_does(lan: Lan) -> None:
+    robot = lan.script()
+    lamp = robot.neighbour("minilamp")
+    assert until(lambda: lamp.latest(ONLINE) is not None), "goob receives what it shares"
+    assert until(lambda: lan.drives(robot, 0.3))
+    assert until(lambda: lan.newest("neighbours")["driven_by"] == "goob")
+    lan.send(DRIVE.topic(LAMP), {"x": 0, "z": 0})
+    assert until(lambda: lamp.why_refused)
+    assert until(lambda: not lan.board.moving("minilamp"), STOP_S)
+    assert not lan.drives(robot, 0.5), "a person has ended its run"
+    time.sleep(2.0)  # which holds for this long
+    again = lan.script()
+    assert until(lambda: lan.drives(again, 0.3)), "a new start drives"
+    lan.send(ESTOP.topic(LAMP), {"stop": "s" * 16, "by": "ann"})
+    assert until(lambda: lan.newest("estop/mcu").get("latched")), "the operators' stop"
+    assert not lan.drives(again, 0.5)

@@ -1,17 +1,21 @@
-"""What a hub takes from an account of another machine."""
+"""What a hub takes from an account of another machine, and what a neighbour's account may do there."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from pebble.extensions.fleet.folder import Fleet, Server, refused
 from pebble.extensions.fleet.hub_access import Access, AccountAdmission, HubAccount, access_control, written
+from pebble.extensions.fleet.roles import Account, rules
 from pebble.transports import QoS
+from pebble.transports.topics import matches
 from pebble.transports.zenoh.hub.records import Retained
 from pebble.transports.zenoh.wire import Hello, Stamp, Will, account_of, asked
 
-GOOB = "pebble/robots/goob"
+FRED, GOOB = "pebble/robots/fred", "pebble/robots/goob"
 WILL = Will(f"{GOOB}/outgoing/online", b"0", QoS.DELIVERED, True, "goob-bridge")
 OWN = {f"{GOOB}/outgoing/online": 1, "pebble/robots/fred/outgoing/online": 2, "@%24SYS/x": None}
 
@@ -65,3 +69,44 @@ def test_the_account_stands_in_the_key() -> None:
     for key in ("@hub/hello/*", "@hub/hello/a/b", "@hub/hello/a~b", "@hub/bye/otto"):
         with pytest.raises(ValueError, match="is no query"):
             account_of(key, "@hub/hello")
+
+
+# -- neighbours
+
+
+def neighbour(name: str) -> Account:
+    return Account(roles=("neighbour",), bases=(f"pebble/robots/{name}",))
+
+
+#: Topics at the hub, and whether goob's account writes them and reads them.
+TOPICS = {
+    f"{FRED}/incoming/from/goob/drive-values": (True, False),
+    f"{FRED}/incoming/from/goob/lights-solid": (False, False),
+    f"{FRED}/incoming/from/carl/drive-values": (False, False),
+    f"{FRED}/incoming/drive-values": (False, False),
+    f"{FRED}/outgoing/wheel-odometry": (False, True),
+    f"{GOOB}/outgoing/wheel-odometry": (True, True),
+    f"{GOOB}/incoming/from/carl/drive-values": (False, True),
+    f"{GOOB}/incoming/drive-values": (False, False),
+    "pebble/lamps/lamp/outgoing/online": (False, False),
+}
+
+
+@pytest.mark.parametrize("level", ["login", "named"])
+def test_an_account_of_a_neighbour_speaks_for_its_own_base(level: Any) -> None:
+    held = rules("goob-lan", neighbour("goob"), level, at_hub=True)
+    found = {
+        topic: tuple(
+            any(matches(rule.filter, topic) for rule in held if rule.access == one) for one in ("write", "read")
+        )
+        for topic in TOPICS
+    }
+    assert found == TOPICS
+    assert rules("goob-lan", neighbour("goob"), level) == (), "at a broker it is nothing"
+
+
+def test_one_neighbour_has_a_base() -> None:
+    accounts = {"goob": Account(roles=("robot",), bases=(GOOB,)), "goob-lan": neighbour("goob")}
+    fleet = Fleet(level="login", brokers=(Server(host="127.0.0.1"),), accounts=accounts)
+    assert refused(fleet, "two", neighbour("goob")) == f"{GOOB} belongs to goob-lan"
+    assert refused(fleet, "two", neighbour("fred")) == ""

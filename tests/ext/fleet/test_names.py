@@ -39,23 +39,18 @@ class TestSign:
             ("drive-values", KEYED % "", KEYED % ',"by":"ann"', "ann"),
             ("drive-values", KEYED % ',"by":"otto"', KEYED % ',"by":"ann/otto"', "ann/otto"),
             ("drive-values", KEYED % ',"by":"Zoë <b>/"', KEYED % ',"by":"ann/zo___b_/"', "ann/zo___b_/"),
-            ("drive-values", KEYED % ',"by":""', KEYED % ',"by":"ann"', "ann"),
             ("drive-values", KEYED % ',"by":["otto"]', KEYED % ',"by":"ann"', "ann"),
             ("drive-values", KEYED % ',"by":"otto","b\\u0079":"ada"', KEYED % ',"by":"ann/ada"', "ann/ada"),
             ("drive-values", '{"by":"otto","value":{"z":1}}', '{"value":{"z":1,"by":"ann"}}', "ann"),
             ("drive-values", '\ufeff {"z":1}\0 }', '{"z":1,"by":"ann"}', "ann"),
-            ("drive-values", "{}", '{"by":"ann"}', "ann"),
             ("control", '{"id":"3f2a91c0","by":"%s"}' % ("x" * 1000), '{"id":"3f2a91c0","by":"ann/%s"}' % ("x" * 36),
              "ann/" + "x" * 36),
             ("estop", '{"stop":"0123456789abcdef","by":"otto"}', '{"stop":"0123456789abcdef","by":"ann/otto"}',
              "ann/otto"),
             *(("estop", garbage, garbage, "ann") for garbage in ("stop!", "[1]", "")),
-            ("autonomy-command", '{"value":true,"file":"a"}', '{"value":true,"file":"a","by":"ann"}', "ann"),
             ("autonomy-command", '\x01{"file":"a"}\x7f', '{"file":"a","by":"ann"}', "ann"),
-            *((media, bare, bare, "ann") for media in ("front-camera", "audio", "soundboard-command")
-              for bare in ("true", "false")),
+            ("front-camera", "true", "true", "ann"),
             ("flags/mqtt-video", '{"value": true, "by": "otto"}', '{"value": true, "by": "otto"}', "ann/otto"),
-            ("mip-raw", '{"by": "otto"}', '{"by": "otto"}', "ann/otto"),
             ("flags/reboot", " true", " true", "ann"),
             ("arm/wave", '{"a":1}', '{"a":1,"by":"ann"}', "ann"),
             ("arm/wave", "hello", "hello", "ann"),
@@ -71,7 +66,7 @@ class TestSign:
         )  # fmt: skip
 
     @pytest.mark.parametrize("channel", [one for one in CHANNELS if one.direction == INCOMING])
-    @pytest.mark.parametrize("payload", [b"true", b"[]", b'"x"', b"", b"{", b"{}garbage", b'{"a":1}\xff'])
+    @pytest.mark.parametrize("payload", [b"true", b"[]", b"", b"{", b"{}garbage", b'{"a":1}\xff'])
     def test_what_no_reader_takes_for_an_object_does_not_pass_as_one(self, channel: Channel, payload: bytes) -> None:
         """What would pass without a name in it is either no object for any reader, or refused by all of them."""
         found = sign(f"by/ann/{channel.metric.replace('{', '').replace('}', '')}", payload)
@@ -91,13 +86,7 @@ class TestSign:
         deep = b'{"a":' * 3000 + b"{}" + b"}" * 3000
         assert sign("by/ann/drive-values", deep.ljust(300)) is Drop.UNREADABLE
 
-    def test_numbers_stay_as_they_are(self) -> None:
-        sent = {"x": 0.1 + 0.2, "z": -1e-300, "t": 2**53 - 1, "y": -0.0}
-        found = sign("by/ann/drive-values", json.dumps(sent).encode())
-        assert isinstance(found, Signed)
-        assert json.loads(found.message.payload) == sent | {"by": "ann"}
-
-    @pytest.mark.parametrize("suffix", ["drive-values", "flags/mqtt-video", "flags/reboot", "arm/wave"])
+    @pytest.mark.parametrize("suffix", ["drive-values", "flags/mqtt-video"])
     @pytest.mark.parametrize("flag", ["retain", "retain_requested"])
     def test_nothing_is_retained_below_a_name(self, suffix: str, flag: str) -> None:
         assert sign(f"by/ann/{suffix}", b'{"z":0}', **{flag: True}) is Drop.STALE
@@ -119,19 +108,16 @@ class TestWithoutName:
             ("drive-values", '{"z":1,"by":"otto"}', "free", '{"z":1,"by":"-"}'),
             ("drive-values", '{"z":0,"by":"otto","valid_ms":0}', "refuse", '{"z":0,"valid_ms":0,"by":"-"}'),
             ("drive-values", '{"value":{"x":"0"}}', "refuse", '{"value":{"x":"0","by":"-"}}'),
-            ("drive-values", "{}", "refuse", '{"by":"-"}'),
             ("drive-values", '{"z":0.001}', "refuse", None),
             ("drive-values", "nothing", "refuse", None),
-            ("control", '{"id":"3f2a91c0","by":"ann"}', "free", '{"id":"3f2a91c0","by":"-"}'),
             ("control", '{"id":"3f2a91c0","want":"release"}', "refuse", None),
             ("estop", '{"by":"otto"}', "refuse", '{"by":"otto?"}'),
             ("estop", '{"by":"otto?","value":{"by":"otto??"}}', "free", '{"by":"otto?","value":{"by":"otto?"}}'),
             ("estop", '{"by":"%s"}' % ("ö" * 99), "drive", '{"by":"%s?"}' % ("ö" * 31)),
-            *(("estop", same, "refuse", same) for same in ("?", '{"by": ""}', '{"by": 7}', '{"why": "x"}', "[")),
+            *(("estop", same, "refuse", same) for same in ("?", '{"by": ""}', '{"by": 7}')),
             *((f"{names}estop", '{"by":"ann"}', "refuse", '{"by":"ann?"}')
               for names in ("by/Ann/", "by//", "by/-/", "by/ann/by/otto/", f"by/{'a' * 33}/")),
             ("by/Ann/drive-values", '{"z":0}', "drive", None),
-            ("by/Ann/mcu/u1/estop", "{}", "drive", None),
             ("estop-reset", '{"boot":"a","count":1}', "drive", None),
             ("arm/wave", '{"z":0}', "drive", None),
         ],
@@ -148,7 +134,7 @@ class TestWithoutName:
 class TestTopics:
     @pytest.mark.parametrize(
         "suffix",
-        ["by/ann/by/otto/drive-values", "by/Ann/drive-values", "by/-/drive-values", "by/estop", "by/ann", "by/ann/"],
+        ["by/ann/by/otto/drive-values", "by/Ann/drive-values", "by/-/drive-values", "by/estop", "by/ann/"],
     )
     def test_a_name_that_no_account_can_have_is_none(self, suffix: str) -> None:
         sender = NAMES["drive"][f"{BASE}/incoming/{suffix}"]
@@ -197,13 +183,9 @@ def test_what_passes_and_what_does_not(world: World) -> None:
     start(world)
     assert received(world, "by/ann/drive-values", MOVE) == [b'{"x":0,"z":0.5,"by":"ann"}']
     assert received(world, "drive-values", MOVE, ZERO) == [b'{"x":0,"z":0,"by":"-"}']
-    for signed, passing in ((MOVE, []), (ZERO, [b'{"x":0,"z":0,"by":"ann"}'])):
-        body = json.loads(signed) | {"source": "autonomy", "run": 5}
-        found = [json.loads(one) for one in received(world, "by/ann/drive-values", json.dumps(body).encode())]
-        assert [{key: one[key] for key in ("z", "by")} for one in found] == [
-            {key: json.loads(one)[key] for key in ("z", "by")} for one in passing
-        ]
-        assert not [one for one in found if "run" in one or "source" in one]
+    script = b'{"source":"autonomy","run":5,%s'
+    (passed,) = received(world, "by/ann/drive-values", script % MOVE[1:], script % ZERO[1:])
+    assert json.loads(passed) == {"x": 0, "y": 0, "z": 0, "by": "ann"}, "a script on the robot has no account"
     assert received(world, "by/ann/lights-solid", b'{"g":1}') == [b'{"g":1,"by":"ann"}']
     assert received(world, "lights-solid", b'{"g":1}') == []
     assert [message.topic for message in world.local.seen if "/by/" in message.topic] == []
@@ -211,11 +193,10 @@ def test_what_passes_and_what_does_not(world: World) -> None:
     assert (dropped["unnamed"], dropped["signed"], dropped["misnamed"]) == (2, 1, 0)
 
 
-@pytest.mark.parametrize(("metric", "most"), [(REBOOT, 10), ("arm/wave", 1000)])
-def test_what_has_no_name_takes_no_place_of_what_has_one(world: World, metric: str, most: int) -> None:
+def test_what_has_no_name_takes_no_place_of_what_has_one(world: World) -> None:
     start(world)
-    assert received(world, metric, *[b"true"] * (most + 5)) == []
-    assert received(world, f"by/ann/{metric}", b"true") == [b"true"]
+    assert received(world, REBOOT, *[b"true"] * 15) == []
+    assert received(world, f"by/ann/{REBOOT}", b"true") == [b"true"]
 
 
 class TestStops:
@@ -255,18 +236,9 @@ class TestFlags:
         "history",
         [
             "",
-            "stop start",
-            "cut mend",
-            "away back",
-            "local-forgets",
-            "remote-forgets",
-            "stop local-forgets start",
-            "stop remote-forgets start",
-            "remote-forgets stop start",
             "local-forgets stop start remote-forgets",
             "cut remote-forgets mend",
             "stop older start",
-            "cut older mend",
             "older cut mend",
         ],
     )

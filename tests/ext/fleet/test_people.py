@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 
 from pebble.errors import PebbleError
-from pebble.extensions.fleet.broker_files import new_password
 from pebble.extensions.fleet.database import DatabaseError
 from pebble.extensions.fleet.people import SESSION_S, People, PeopleError, TooManyTriesError, User, has_user
 from pebble.extensions.fleet.roles import Role, page_rights
@@ -55,32 +54,25 @@ UMLAUT = {"one letter": "Schl\u00fcssel", "two letters, as on macOS": "Schlu\u03
 
 
 @pytest.mark.parametrize("typed", UMLAUT)
-@pytest.mark.parametrize("stored", [*UMLAUT, *(f"earlier version: {how}" for how in UMLAUT)])
+@pytest.mark.parametrize("stored", UMLAUT)
+@pytest.mark.parametrize("earlier", [False, True])
 def test_a_password_is_right_in_either_spelling_of_its_accents(
-    people: People, monkeypatch: pytest.MonkeyPatch, stored: str, typed: str
+    people: People, monkeypatch: pytest.MonkeyPatch, stored: str, typed: str, earlier: bool
 ) -> None:
-    earlier, _, how = stored.rpartition(": ")
-    if earlier:
+    if earlier:  # a version that stored it as it was typed
         monkeypatch.setattr("pebble.extensions.fleet.people.usable", lambda password: password)
-    people.set_password("alice", UMLAUT[how])
-    people.add("bob", UMLAUT[how], Role.VIEWER)
+    people.set_password("alice", UMLAUT[stored])
+    people.add("bob", UMLAUT[stored], Role.VIEWER)
     assert [people.check(name, UMLAUT[typed], HERE) is None for name in ("alice", "bob")] == [False, False]
     assert people.check("alice", "Schlussel", HERE) is None
-
-
-def test_passwords_of_brokers_have_no_accents() -> None:
-    """They are ours alone, so that the broker need not know two spellings."""
-    assert new_password().isascii()
 
 
 @pytest.mark.parametrize(
     ("name", "password"),
     [
         ("alice", "wrong horse"),
-        ("alice", ""),
         ("alice", PASSWORD + "x" * 300),
         ("Alice", PASSWORD),
-        ("", PASSWORD),
         ("bob", PASSWORD),
         ("\ud800", "\ud800"),
         ("a" * 100_000, "b" * 100_000),
@@ -99,8 +91,8 @@ def test_an_unknown_name_takes_as_long_as_a_known_one() -> None:
         people.check(name, "wrong horse", f"192.0.2.{address}")
         return time.process_time() - start
 
-    known = sorted(took("alice", number) for number in range(4))[1]
-    unknown = sorted(took(f"bob{number}", 10 + number) for number in range(4))[1]
+    known = min(took("alice", number) for number in range(2))
+    unknown = min(took(f"bob{number}", 10 + number) for number in range(2))
     assert unknown > known / 3
     assert known > unknown / 3
     people.close()
@@ -149,7 +141,7 @@ def test_one_network_of_ipv6_is_one_address(people: People) -> None:
     assert network_of("?") == "?"
 
 
-@pytest.mark.parametrize("name", ["", "Alice", "a" * 33, "anna/drive-values", "a b", "ä", "alice\n", "+", "#"])
+@pytest.mark.parametrize("name", ["", "Alice", "a" * 33, "anna/drive-values", "ä", "alice\n", "+"])
 def test_names_that_could_be_part_of_a_topic_are_refused(people: People, name: str) -> None:
     with pytest.raises(PeopleError, match="is no name"):
         people.add(name, PASSWORD, Role.VIEWER)
@@ -182,11 +174,14 @@ def test_a_session_starts_and_ends(people: People) -> None:
     assert session is not None
     assert (session.user, session.role) == ("alice", Role.DRIVER)
     assert session.id not in token
+    people.set_role("alice", Role.VIEWER)
+    changed = people.session(token)
+    assert (changed and changed.role) == Role.VIEWER
     people.end_session(token)
     assert people.session(token) is None
 
 
-@pytest.mark.parametrize("token", ["", "x", "\ud800", "' OR 1=1 --", "x" * 100_000])
+@pytest.mark.parametrize("token", ["", "\ud800", "' OR 1=1 --", "x" * 100_000])
 def test_no_other_token_is_a_session(people: People, token: str) -> None:
     people.start_session(User("alice", Role.DRIVER))
     assert people.session(token) is None
@@ -198,14 +193,6 @@ def test_a_session_expires(people: People, clock: Clock) -> None:
     assert people.session(token) is not None
     clock.now += 1
     assert people.session(token) is None
-
-
-def test_a_new_role_counts_for_running_sessions(people: People) -> None:
-    token = people.start_session(User("alice", Role.DRIVER))
-    people.set_role("alice", Role.VIEWER)
-    session = people.session(token)
-    assert session is not None
-    assert session.role is Role.VIEWER
 
 
 def test_removal_and_a_new_password_end_sessions(people: People) -> None:

@@ -67,12 +67,6 @@ def test_a_stop_in_a_container_is_saved_on_a_volume_only(
     assert any("/dev/serial/by-id" in line for line in lines)
 
 
-def test_elsewhere_nothing_is_said(container: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("PEBBLE_CONTAINER")
-    assert facts(_config(container)).table == ()
-    assert not StateFile(Path("/estop.json")).lost
-
-
 def _config(state: Path) -> Any:
     serial = {"serial_mcu_bridge": {"enabled": True, "serial": {"port": "/dev/ttyACM0"}}}
     return parse(

@@ -1,4 +1,4 @@
-"""Two robots' services and a script between them, on networks inside this process."""
+"""Two robots' services and a script between them, on networks inside this process; and what is refused in configs."""
 
 from __future__ import annotations
 
@@ -13,11 +13,13 @@ import pytest
 from msgspec.structs import replace
 
 from pebble.config import Config, parse
+from pebble.config.raw import deep_merge
 from pebble.contract import DRIVE, ESTOP_STATE, FROM_NEIGHBOUR, NEIGHBOURS, WHEEL_ODOMETRY, codec
 from pebble.contract.payloads import SCRIPT, Drive, EstopState, Neighbours, WheelOdometry
-from pebble.errors import PebbleError
+from pebble.errors import ConfigError, PebbleError
 from pebble.extensions.scripts.runs import LocalScripts
 from pebble.extensions.scripts.script import NotGrantedError, Robot, Stopped
+from pebble.services.neighbours.config import MOST_METRICS, MOST_NEIGHBOURS
 from pebble.services.neighbours.service import MOST_BYTES, NeighboursService
 from pebble.transports import Message, QoS, Transport, clock
 from pebble.transports.memory import MemoryHub, MemoryTransport
@@ -199,3 +201,31 @@ def test_operators_see_who_receives_what_and_who_drives(pair: Pair) -> None:
     pair.robot.neighbour("fred").drive(z=0.4)
     assert until(lambda: pair.fred.state.driven_by == "goob")
     assert pair.fred.state.commanded == {"goob": ["drive-values"]}
+
+
+# -- what is refused in `services.neighbours`
+
+LAN = {"connect": ["tls/hub.lab:7447"]}
+LISTENS = {"transport": {"kind": "zenoh", "listen": ["tcp/0.0.0.0:7447"]}}
+BRIDGE = {"mqtt_bridge": {"enabled": True, "remote": {"kind": "zenoh", **LAN}}}
+#: A section, what else the config has, and why it is refused.
+WRONG: list[tuple[dict[str, Any], dict[str, Any], str]] = [
+    ({"lan": {}}, {}, r"lan\.connect: is missing"),
+    ({"lan": LAN | {"account": "goob-lan"}}, {}, r"lan\.account: needs tls\.client_cert"),
+    ({"shares": ["front-camera"]}, {}, "front-camera cannot be shared"),
+    ({"listens": {"fred": ["control/wheels"]}}, {}, "control/wheels cannot be shared"),
+    ({"commanded": {"goob": ["estop-reset"]}}, {}, r'must be \["drive-values"\]'),
+    ({"listens": {f"r{n}": [] for n in range(MOST_NEIGHBOURS + 1)}}, {}, "are the most"),
+    ({"shares": [f"m{n}" for n in range(MOST_METRICS + 1)]}, {}, "are the most"),
+    ({"lan": {"connect": ["tcp/hub.lab:7447"]}}, {"security": {"level": "login"}}, "is not encrypted"),
+    ({"lan": {"connect": ["tcp/hub.lab:7447"]}}, {"security": {"level": "login"}}, r"lan\.account: is missing"),
+    ({"lan": {"connect": ["tls/hub.lab:7447#x=1"]}}, {"services": BRIDGE}, r"also services\.mqtt_bridge\.remote\.conn"),
+    ({"lan": {"connect": ["tcp/127.0.0.1:7447"]}}, LISTENS, r"is also transport\.listen"),
+]
+
+
+@pytest.mark.parametrize(("section", "more", "why"), WRONG)
+def test_what_is_refused(section: dict[str, Any], more: dict[str, Any], why: str) -> None:
+    raw = {"robot": {"id": "goob"}, "services": {"neighbours": {"enabled": True, "lan": LAN, **section}}}
+    with pytest.raises(ConfigError, match=why):
+        parse(deep_merge(raw, more), folder=Path("/"), env={})

@@ -83,8 +83,7 @@ ROBOTS = (robot_in_python, robot_in_arduino, robot_in_micropython)
 OPERATORS = (operator_in_python, operator_in_javascript)
 
 
-NATS = MAKERS["nats"]
-WITHOUT_NATS = pytest.mark.skipif(NATS.missing(), reason="needs NATS: make long PART=brokers")
+WITHOUT_NATS = pytest.mark.skipif(MAKERS["nats"].missing(), reason="needs NATS: make long PART=brokers")
 PASSWORDS = {"mine": "any robot", "ann": "any person"}
 
 

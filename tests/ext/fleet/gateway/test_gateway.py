@@ -161,13 +161,10 @@ def test_a_robot_that_is_silent_is_carried_no_more_until_its_will_comes(alone: W
     ("topic", "payload", "retain", "passes"),
     [
         ("incoming/lights-solid", b'{"r": 1}', False, True),
-        ("incoming/lights-solid", b'{"r": 1}', True, False),
         ("incoming/by/ann/drive-values", b'{"x": 0.1, "z": 0}', False, True),
         ("incoming/by/ann/drive-values", b'{"x": 0.1, "z": 0}', True, False),
         ("incoming/by/ann/flags/mqtt-video", b"true", False, True),
         ("incoming/flags/reboot", b"true", False, True),
-        ("incoming/estop", b'{"stop": "s1"}', False, True),
-        ("incoming/by/ann/estop", b'{"stop": "s1"}', False, True),
         ("incoming/drive-values", b'{"x": 1, "z": 0, "source": "autonomy", "run": 1}', False, False),
         ("outgoing/status", b"{}", False, False),
     ],
@@ -186,35 +183,11 @@ def test_commands_of_the_hub_and_what_runs_there_do_not_reach_the_broker(alone: 
     assert [one.topic for one in alone.operators[0].seen if b"hub" in one.payload] == []
 
 
-def test_pictures_pass_while_they_are_allowed_until_an_operator_ends_them(alone: World) -> None:
-    (robot,), (operator,) = alone.robots, alone.operators
-
-    def passes() -> bool:
-        before = len(operator.on("outgoing/front-camera"))
-        robot.publish("outgoing/front-camera", b"picture", qos=0)
-        alone.run(0.1, sending=False)
-        return len(operator.on("outgoing/front-camera")) > before
-
-    assert not passes(), "the flag is not known"
-    operator.publish("incoming/flags/mqtt-video", b"true", retain=True)
-    alone.run(0.1)
-    assert passes(), "it is not known who has requested them"
-    operator.publish("incoming/front-camera", b'{"enabled": false}')
-    alone.run(0.1)
-    assert not passes()
-    operator.publish("incoming/front-camera", b'{"enabled": true}')
-    alone.run(0.1)
-    assert passes()
-    operator.publish("incoming/flags/mqtt-video", b"false", retain=True)
-    alone.run(0.1)
-    assert not passes()
-
-
-@pytest.mark.parametrize("state", ["not heard", "listens", "carried", "stops away", "broker flooded"])
+@pytest.mark.parametrize("state", ["not heard", "carried", "stops away", "broker flooded"])
 def test_a_live_stop_passes_once_in_every_state(state: str) -> None:
     world = World("a")
     gate = world.running["a"]
-    world.run({"not heard": STEP_S, "listens": 0.5}.get(state, 3.0))
+    world.run(STEP_S if state == "not heard" else 3.0)
     if state == "stops away":
         gate.stops.cut()
     elif state == "broker flooded":
@@ -228,7 +201,8 @@ def test_a_live_stop_passes_once_in_every_state(state: str) -> None:
 
 def test_robots_begin_together(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each waits for hub and broker, and a gateway may take hundreds from one that has died."""
-    robots = tuple(f"pebble/robots/r{number}" for number in range(5 * module.TOGETHER))
+    monkeypatch.setattr(module, "TOGETHER", 2)
+    robots = tuple(f"pebble/robots/r{number}" for number in range(10))
     world = World("a", robots=robots)
     broker = world.running["a"].broker
     ask = broker.ask
@@ -323,14 +297,6 @@ def test_it_starts_once_the_first_has_gone(alone: World, name: str) -> None:
     alone.running[name] = Running(alone, name)
     alone.run(3)
     assert alone.all_pass()
-
-
-def test_gateways_of_other_robots_share_a_broker() -> None:
-    world = World(robots=(GOOB, FRED))
-    world.running = {"a": Running(world, "a", GOOB), "b": Running(world, "b", FRED)}
-    world.run(3)
-    assert [one.gateway.carries for one in world.running.values()] == [{GOOB}, {FRED}]
-    assert world.all_pass()
 
 
 @pytest.mark.parametrize("names", [("a", "b"), ("a", "a")])

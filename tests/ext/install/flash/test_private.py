@@ -40,9 +40,7 @@ def test_the_settings_hold_identity_wifi_and_broker() -> None:
     [
         ({"level": "open"}, None),
         ({"strangers": "drive"}, {"level": "open", "strangers": "drive"}),
-        ({"level": "login"}, {"level": "login", "strangers": "free"}),
         ({"level": "named"}, {"level": "named", "strangers": "refuse"}),
-        ({"level": "named", "strangers": "drive"}, {"level": "named", "strangers": "drive"}),
     ],
 )
 def test_the_level_goes_along(security: dict[str, str], section: dict[str, str] | None) -> None:
@@ -61,26 +59,22 @@ def test_names_that_the_firmware_refuses_never_get_to_a_board() -> None:
 def test_the_brokers_password_comes_from_a_file_or_the_environment(tmp_path: Path) -> None:
     file = tmp_path / "password"
     file.write_text("von der datei\n")
-    by_file = private_files(config(username="ann", password_file=str(file)), C6, ssid="Lab", wifi_password="")
-    by_env = private_files(
-        config({"PW": "aus env"}, username="ann", password_env="PW"), C6, ssid="Lab", wifi_password=""
-    )
-    assert by_file.settings["mqtt"]["password"] == "von der datei"
-    assert by_env.settings["mqtt"]["password"] == "aus env"
-    assert "datei" not in by_file.shown() + repr(by_file)
-    assert "env" not in by_env.shown() + repr(by_env)
-    assert "von der datei" in by_file.text()
+    given = {"von der datei": config(username="ann", password_file=str(file))}
+    given["aus env"] = config({"PW": "aus env"}, username="ann", password_env="PW")
+    for password, one in given.items():
+        private = private_files(one, C6, ssid="Lab", wifi_password="")
+        assert private.settings["mqtt"]["password"] == password
+        assert password not in private.shown() + repr(private)
+        assert '"password": "***"' in private.shown()
+        assert password in private.text()
 
 
 def test_an_authority_goes_along_as_der() -> None:
     private = private_files(config(tls={"enabled": True, "ca_cert": str(CA)}), C6, ssid="Lab", wifi_password="")
     assert private.settings["mqtt"]["tls"] == {"ca": "/ca.der", "server_name": "broker.lab"}
     assert private.ca == ssl.PEM_cert_to_DER_cert(CA.read_text())
-
-
-def test_encryption_without_checks_has_to_be_asked_for() -> None:
-    tls = {"enabled": True, "insecure": True}
-    assert private_files(config(tls=tls), C6, ssid="Lab", wifi_password="").settings["mqtt"]["tls"] is True
+    unchecked = private_files(config(tls={"enabled": True, "insecure": True}), C6, ssid="Lab", wifi_password="")
+    assert unchecked.settings["mqtt"]["tls"] is True, "it has to be asked for"
 
 
 @pytest.mark.parametrize(
@@ -109,12 +103,8 @@ def test_a_wifi_that_cannot_be_is_refused_without_its_password(ssid: str, passwo
     assert password not in str(problem.value)
 
 
-@pytest.mark.parametrize("host", ["broker.example", "localhost", "127.0.0.1", "::1"])
+@pytest.mark.parametrize("host", ["broker.example", "localhost", "::1"])
 def test_a_broker_that_no_board_reaches_is_refused(host: str) -> None:
     with pytest.raises(PebbleError, match=f"local_mqtt.host: .*{host}"):
         check_broker(config(host=host))
-
-
-def test_other_brokers_are_accepted() -> None:
-    for host in ("broker.lab", "192.168.1.2", "pi.local"):
-        check_broker(config(host=host))
+    check_broker(config(host="192.168.1.2"))

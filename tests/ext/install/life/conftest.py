@@ -57,25 +57,13 @@ def packages(tmp_path_factory: pytest.TempPathFactory) -> Packages:
 
 
 @pytest.fixture(scope="session")
-def wheels() -> Path:
-    """What a slot is built from where there is no network."""
-    if not any(WHEELS.glob("*.whl")):
-        pytest.skip("needs the wheels of a robot: make long PART=life fetches them")
-    return WHEELS
-
-
-@pytest.fixture(scope="session")
-def possible() -> None:
+def installed(tmp_path_factory: pytest.TempPathFactory, packages: Packages) -> Iterator[Machine]:
+    """A machine that is off, with the old package and its slot."""
     if reason := missing():
         pytest.skip(reason)
-
-
-@pytest.fixture(scope="session")
-def installed(
-    tmp_path_factory: pytest.TempPathFactory, packages: Packages, wheels: Path, possible: None
-) -> Iterator[Machine]:
-    """A machine that is off, with the old package and its slot."""
-    machine = Machine(tmp_path_factory.mktemp("installed"), [packages.folder, wheels])
+    if not any(WHEELS.glob("*.whl")):  # what a slot is built from where there is no network
+        pytest.skip("needs the wheels of a robot: make long PART=life fetches them")
+    machine = Machine(tmp_path_factory.mktemp("installed"), [packages.folder, WHEELS])
     try:
         machine.boot()
         machine.sh(f"apt-get install --quiet --yes /mnt/{packages.folder.name}/{OLD}/*.deb", timeout=300)
@@ -88,7 +76,7 @@ def installed(
 
 
 @pytest.fixture
-def machine(tmp_path: Path, installed: Machine, packages: Packages, wheels: Path) -> Iterator[Machine]:
+def machine(tmp_path: Path, installed: Machine, packages: Packages) -> Iterator[Machine]:
     """One that has just been installed, and runs."""
-    with Machine(tmp_path / "machine", [packages.folder, wheels], installed) as booted:
+    with Machine(tmp_path / "machine", [packages.folder, WHEELS], installed) as booted:
         yield booted

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
 
 from tests.ext.install.life.conftest import NEW, OLD, Packages
-from tests.ext.install.life.robots import CONFIG, Robot
+from tests.ext.install.life.robots import Robot
 from tests.kit.machine import Machine
-from tests.support import until
 
 UNITS = ("pebble.service", "pebble-slot.service")
 
@@ -35,19 +33,6 @@ def test_units_are_clean_and_confined(machine: Machine) -> None:
     assert [unit for unit in UNITS if machine.exposure(unit) > 2.0] == []
     assert machine.run("dpkg", "--verify", "pebble-robot") == ""
     assert machine.run("/bin/sh", "-c", "setpriv --reuid nobody --clear-groups pebble --version") == f"pebble {OLD}\n"
-
-
-@pytest.mark.skipif(shutil.which("gst-launch-1.0") is None, reason="GStreamer is not installed")
-def test_the_sockets_of_gstreamer_are_there_with_the_robot_that_names_the_example(machine: Machine) -> None:
-    robot, path = Robot(machine), "/run/pebble/video.sock"
-    example = "/run/pebble-slot/current/share/pebble/examples/gstreamer_sockets.py"
-    devices = CONFIG["services"]["av_daemon"]
-    sockets = {**devices, "video": {**devices["video"], "socket_path": path}}
-    services = {**CONFIG["services"], "av_daemon": sockets}
-    robot.configure({**CONFIG, "services": services, "extensions": {example: {}}})
-    robot.plug_in()
-    robot.start()
-    assert until(lambda: machine.succeeds("test", "-S", path), 60, step=1), machine.journal("pebble.service")
 
 
 def test_a_newer_package_is_built_beside_and_the_older_one_is_one_command_away(
@@ -109,25 +94,6 @@ def test_a_signed_release_is_taken_and_a_changed_or_older_one_leaves_the_slots_a
     assert machine.run("cat", "/var/lib/pebble-update/sequence") == "2\n"
     again = machine.run("pebble-slot", "take", "/srv/new", check=False)
     assert again == "pebble: refused: release 0.2.0 is number 2, and number 2 was taken here\n"
-
-
-def test_a_slot_whose_python_went_is_built_anew_from_an_index(machine: Machine) -> None:
-    machine.sh(
-        "mkdir /srv/index && cd /srv/index && for wheel in /mnt/wheels/*.whl; do name=$(basename $wheel | cut -d- -f1 |"
-        " tr '[:upper:]_.' '[:lower:]--'); mkdir -p $name && ln -s $wheel $name; done"
-    )
-    serve = ("python3", "-m", "http.server", "--bind", "127.0.0.1", "--directory", "/srv/index", "8000")
-    machine.run("systemd-run", "--quiet", "--unit=index", *serve)
-    machine.run("mkdir", "-p", "/etc/systemd/system/pebble-slot.service.d")
-    setting = "[Service]\nEnvironment=PIP_INDEX_URL=http://127.0.0.1:8000\n"
-    machine.write("/etc/systemd/system/pebble-slot.service.d/index.conf", setting)
-    machine.run("systemctl", "daemon-reload")
-    machine.run("ln", "-sf", "/usr/bin/python3.99", "/opt/pebble/a/bin/python3")
-    command = ("setpriv", "--reuid=nobody", "--clear-groups", "pebble", "check", "--help")
-    assert not machine.succeeds(*command)
-    machine.run("dpkg-trigger", "--by-package=python3-minimal", "/usr/bin/python3.11")
-    machine.run("dpkg", "--configure", "--pending")
-    assert until(lambda: machine.succeeds(*command), 600, step=1), machine.journal("pebble-slot.service")
 
 
 @pytest.mark.parametrize(("how", "left"), [("remove", True), ("purge", False)])

@@ -1,10 +1,13 @@
-"""A whole robot of the package under a real systemd: it drives, stops, shows and sounds within its unit's limits."""
+"""Whole robots under a real systemd: within the unit's limits, and from a file of answers or a backup."""
 
 from __future__ import annotations
 
-import pytest
+import json
+from typing import Any
 
-from tests.ext.install.life.robots import Robot
+from pebble.extensions.checks.report.secrets_here import secrets_of
+from pebble.extensions.operator.places import Places
+from tests.ext.install.life.robots import BASE, PORT, ROBOT, Robot
 from tests.kit.machine import Machine
 from tests.support import until
 
@@ -76,12 +79,90 @@ def test_a_robot_with_media_drives_stops_shows_and_sounds(machine: Machine) -> N
     assert "not permitted" not in machine.journal("pebble.service")
 
 
-@pytest.mark.parametrize("signal", ["KILL", "ABRT"])
-def test_a_robot_that_ends_comes_back_from_its_slot(machine: Machine, signal: str) -> None:
+def test_a_robot_that_is_killed_comes_back_from_its_slot(machine: Machine) -> None:
     robot = Robot(machine)
     robot.configure()
     robot.plug_in()
     robot.start()
-    machine.run("systemctl", "kill", "--kill-whom=main", f"--signal={signal}", "pebble.service")
+    machine.run("systemctl", "kill", "--kill-whom=main", "--signal=KILL", "pebble.service")
     assert robot.receives("outgoing/online")
     assert robot.runs_from() == "a"
+
+
+PASSWORD = "correct horse battery"
+ANSWERS: dict[str, Any] = {
+    "id": ROBOT,
+    "port": PORT,
+    "protocol": "goob_base_v1",
+    "camera": "none",
+    "broker": "here",
+    "page": True,
+    "user": "ann",
+    "password_file": "/srv/password",
+}
+#: As a browser does, except that it takes the robot's own certificate as it comes.
+LOG_IN = f"""
+import json, ssl, urllib.request
+context = ssl._create_unverified_context()
+def ask(path, body=None):
+    data = None if body is None else json.dumps(body).encode()
+    headers = {{"Content-Type": "application/json", "Origin": "https://127.0.0.1:8080"}}
+    request = urllib.request.Request("https://127.0.0.1:8080" + path, data, headers)
+    return urllib.request.urlopen(request, context=context).status
+print(ask("/"), ask("/api/login", {{"user": "ann", "password": "{PASSWORD}"}}))
+"""
+
+
+SETUP = ("pebble", "setup", "--answers", "/srv/answers.json")
+#: What a person types on a robot, with which outputs go to others.
+COMMANDS = (
+    ("pebble", "doctor", "/etc/pebble/robot.json", "--running"),
+    ("pebble", "doctor", "/etc/pebble/robot.json"),
+    ("pebble", "doctor", "--report", "/srv/goob.zip"),
+    ("pebble", "setup", "--backup", "/srv/goob.tar"),
+    ("pebble", "web", "user", "list"),
+    ("systemctl", "restart", "pebble.service"),
+)
+#: Everything but what the robot writes while it runs.
+OWNERS = "find /etc/pebble /etc/mosquitto /var/lib/pebble/people.sqlite -not -type l -printf '%u:%g %m %p\n' | sort"
+BLANK = (
+    "systemctl disable --now pebble; systemctl stop mosquitto;"
+    "rm -r /etc/pebble /var/lib/pebble /etc/mosquitto/pebble /etc/mosquitto/conf.d/pebble.conf;"
+    "systemd-tmpfiles --create pebble.conf"
+)
+
+
+def test_package_and_setup_make_a_robot_with_heartbeats_and_let_its_user_in(machine: Machine) -> None:
+    robot = Robot(machine)
+    robot.plug_in()
+    machine.write("/srv/password", PASSWORD)
+    machine.write("/srv/answers.json", json.dumps(ANSWERS))
+    machine.run("chmod", "600", "/srv/password")
+    with machine.processes_watched() as seen:
+        done = machine.run(*SETUP, timeout=300)
+        remote = json.loads(machine.run("cat", "/etc/pebble/robot.json"))["services"]["mqtt_bridge"]["remote_mqtt"]
+        login = ("-h", remote["host"], "-p", str(remote.get("port", 1883)), "-u", remote["username"])
+        # mosquitto_sub takes passwords from this file, or else only on its command line
+        options = f"-P $(cat /etc/pebble/{remote['password_file']})"
+        machine.sh(f'mkdir -p /root/.config && echo "{options}" >/root/.config/mosquitto_sub')
+        receives = ("mosquitto_sub", *login, "-R", "-C", "5", "-W", "60", "-t", f"{BASE}/outgoing/online")
+        assert machine.succeeds(*receives)
+        log_in = ("python3", "-")
+        assert until(lambda: machine.run(*log_in, check=False, given=LOG_IN) == "200 200\n", 60, step=1), done
+        shown = [done, *(machine.run(*command, check=False, timeout=300) for command in COMMANDS)]
+        assert machine.succeeds(*receives)
+        again = machine.run(*SETUP, timeout=300)
+        assert "All is so already." in again
+        before = machine.sh(OWNERS)
+        machine.sh(BLANK)
+        restored = ("pebble", "setup", "--from", "/srv/goob.tar")
+        shown.append(machine.run(*restored, timeout=300, given="y\n"))  # its board is in /run, which is asked for
+        assert machine.succeeds(*receives), "the backup is the same robot"
+        assert machine.sh(OWNERS) == before
+        machine.run("env", "PLANTED=in-an-environment", "sleep", "1.5")
+    texts = [*(text.decode(errors="replace") for text in seen), *shown, machine.run("journalctl", "--output=export")]
+    secrets = secrets_of(Places(machine.root), None, [machine.root / "srv/password"])
+    assert len(secrets.known) > 5, "passwords, and keys of the page and of the broker"
+    assert [text for text in texts if secrets.hidden(text) != text] == []
+    planted = (b"in-an-environment", b"sleep\x001.5", b"mosquitto_sub\0", b"--running\0", b"--report\0", b"--backup\0")
+    assert [text for text in planted if not any(text in one for one in seen)] == [], "that is found where it is"

@@ -53,11 +53,8 @@ def test_the_command(places: Places, tmp_path: Path, run: Run, monkeypatch: pyte
     finally:
         os.umask(before)
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
-    assert "It holds passwords and private keys" in run.err
-    assert f"not in it: {places.state / 'recordings'}: recordings" in run.out
     assert not [one for one in (PAGE, MQTT, ROBOT) if one in run.out + run.err]
-    about = read(file).about
-    assert (about.format, about.id) == (1, "goob")
+    assert read(file).about.id == "goob"
     first = file.read_bytes()
     assert run("setup", "--backup", file) == 2
     assert "exists: name another file" in run.err
@@ -77,11 +74,9 @@ def test_nothing_is_left_of_one_that_cannot_be_made(tmp_path: Path, run: Run, mo
     at(broken.root, monkeypatch)
     assert run("setup", "--backup", file) == 1
     assert "people.sqlite: is" in run.err
-    assert len(run.err.splitlines()) == 1
     at(tmp_path / "elsewhere", monkeypatch)
     assert run("setup", "--backup", file) == 1
     assert "no robot is installed there" in run.err
-    assert run("setup", "--backup", tmp_path / "no" / "folder") == 1
     assert not file.exists()
 
 
@@ -89,9 +84,7 @@ ABOUT_IT = (ABOUT, b'{"format": 1, "version": "0.1", "id": "goob"}')
 FOREIGN: dict[str, tuple[bytes, str]] = {
     "empty": (b"", "is no backup of Pebble"),
     "a picture": (b"\xff\xd8\xff" * 5000, "is no backup of Pebble"),
-    "zeros": (bytes(20_000), "is no backup of Pebble"),
     "another tar": (tar_of(("etc/passwd", b"x")), "does not begin with backup.json"),
-    "not JSON": (tar_of((ABOUT, b"{")), "is not of a backup"),
     "no id": (tar_of((ABOUT, b'{"format": 1, "version": "0.1"}')), "is not of a backup"),
     "a later format": (tar_of((ABOUT, b'{"format": 2, "version": "0.9", "id": "x"}')), "of Pebble 0.9: update Pebble"),
     "absolute": (tar_of(ABOUT_IT, ("/etc/shadow", b"x")), "'/etc/shadow' is not what a backup has"),

@@ -18,12 +18,10 @@ from tests.support import ROOT
 
 OURS, OTHER = Key.fresh(), Key.fresh()
 REFUSED = {
-    "older": ({"sequence": 5}, "release 0.3.0 is number 5, and number 11 was taken here"),
     "the same": ({"sequence": 11}, "release 0.3.0 is number 11, and number 11 was taken here"),
     "too far ahead": ({"from": "7.0.0"}, "release 0.3.0 follows 7.0.0 or newer, and this is "),
     "another Python": ({"python": ">=3.99"}, "release 0.3.0 needs Python >=3.99"),
     "no number": ({"sequence": "12"}, r"RELEASE.json: Expected `int`, got `str` - at `\$.sequence`"),
-    "no files": ({"files": {}}, "RELEASE.json names no file: not a wheel and robot.txt"),
     "a path": ({"files": {"../etc/x": "0"}}, r"RELEASE.json names \.\./etc/x: not a wheel and robot.txt"),
     "another name": ({"files": {WHEEL: "0", "robot.txt": "0", "run.sh": "0"}}, "not a wheel and robot.txt"),
 }

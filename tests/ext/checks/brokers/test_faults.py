@@ -1,0 +1,240 @@
+"""Each promise that a broker breaks is found, and named: by settings of mosquitto, or by a fault before it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
+from pathlib import Path
+
+import pytest
+
+from pebble.check_result import CheckResult, State
+from pebble.extensions.checks.broker.login_attempt import reached
+from pebble.extensions.checks.broker.probes import PROBES, Probe
+from pebble.extensions.checks.check import run
+from pebble.transports import MqttSettings
+from tests.kit.mqtt_bytes import packet
+from tests.sparing_broker import SparingBroker, packet_of
+from tests.support import Broker, further
+
+CONNECT, PUBLISH, SUBSCRIBE, PINGRESP, DISCONNECT = 0x10, 0x30, 0x80, 0xD0, 0xE0
+RETAIN, BRIDGE = 0x01, 0x80
+_LEVEL = 6  # its place in the body of a CONNECT
+_LATE_S = 3.0
+
+
+class Fault:
+    """What passes on one connection: a packet becomes those that go on. ``ends``: what the broker gets at a loss."""
+
+    ends = b""
+    late_s = 0.0  # after which the broker notices a loss
+
+    def __init__(self) -> None:
+        self.answers: list[bytes] = []  # to the client, at once
+
+    def up(self, first: int, body: bytes) -> list[bytes]:
+        return [packet(first, body)]
+
+    def down(self, first: int, body: bytes) -> list[bytes]:
+        return [packet(first, body)]
+
+
+def kind(first: int) -> int:
+    return first & 0xF0
+
+
+class DropsWills(Fault):
+    ends = packet(DISCONNECT, b"")
+
+
+class LateWills(Fault):
+    late_s = _LATE_S
+
+
+class HidesRetained(Fault):
+    """What is retained looks live."""
+
+    def down(self, first: int, body: bytes) -> list[bytes]:
+        return super().down(first & ~RETAIN if kind(first) == PUBLISH else first, body)
+
+
+class Doubles(Fault):
+    def down(self, first: int, body: bytes) -> list[bytes]:
+        return super().down(first, body) * (2 if kind(first) == PUBLISH else 1)
+
+
+class Floods(Fault):
+    """Sends 30 MB after each subscription."""
+
+    def up(self, first: int, body: bytes) -> list[bytes]:
+        if kind(first) == SUBSCRIBE:
+            self.answers += [packet(PUBLISH, b"\0\1x" + bytes(1_000_000))] * 30
+        return super().up(first, body)
+
+
+class Mute(Fault):
+    """Answers no ping."""
+
+    def down(self, first: int, body: bytes) -> list[bytes]:
+        return [] if first == PINGRESP else super().down(first, body)
+
+
+class EagerPongs(Fault):
+    """Answers pings at once, before what waits."""
+
+    def up(self, first: int, body: bytes) -> list[bytes]:
+        if first != 0xC0:
+            return super().up(first, body)
+        self.answers.append(packet(PINGRESP, b""))
+        return []
+
+
+class SendsBack(Fault):
+    """Takes bridge mode and does not keep it; does not take MQTT 5."""
+
+    def up(self, first: int, body: bytes) -> list[bytes]:
+        if first == CONNECT:
+            level = body[_LEVEL] & ~BRIDGE if body[_LEVEL] != 5 else 9
+            body = body[:_LEVEL] + bytes((level,)) + body[_LEVEL + 1 :]
+        return super().up(first, body)
+
+
+class FaultyBroker(SparingBroker):
+    """A proxy on a loopback port of its own, until it is closed."""
+
+    def __init__(self, to: int, fault: type[Fault]) -> None:
+        self._fault = fault
+        super().__init__(to)
+
+    def close(self) -> None:
+        super().close()
+        tasks = asyncio.all_tasks(self._loop)
+        for task in tasks:
+            task.cancel()
+        if tasks:
+            self._loop.run_until_complete(asyncio.wait(tasks))
+        self._loop.close()
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        fault = self._fault()
+        to_reader, to_writer = await asyncio.open_connection("127.0.0.1", self._to)
+        back = asyncio.ensure_future(self._changed(to_reader, writer, fault))
+        with suppress(OSError, asyncio.IncompleteReadError):
+            while True:
+                first, _, body = await packet_of(reader)
+                to_writer.writelines(fault.up(first, body))
+                writer.writelines(fault.answers)
+                fault.answers = []
+        await asyncio.sleep(fault.late_s)
+        with suppress(OSError):
+            to_writer.write(fault.ends)
+        to_writer.close()
+        await back
+
+    async def _changed(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, fault: Fault) -> None:
+        with suppress(OSError, asyncio.IncompleteReadError):
+            while True:
+                first, _, body = await packet_of(reader)
+                writer.writelines(fault.down(first, body))
+        writer.close()
+
+
+RIGHTS, *OTHERS = PROBES
+#: What needs more than a sound broker: an account, or a restart.
+NEED_MORE = ("refused subscriptions", "retained, after a restart")
+
+#: A line of mosquitto.conf, or rules of its acl_file, the probe that finds it, and words of what it tells.
+SETTINGS = [
+    ("set_tcp_nodelay false", "small messages", State.WARN, "holds them back"),
+    ("retain_available false", "rights", State.WARN, "it retains nothing"),
+    further("max_qos 0", "rights", State.WARN, "it has no QoS 1"),
+    further("topic write #", "rights", State.FAILED, "may not read"),
+    further(
+        "topic readwrite pebble/doctor/#",
+        "refused subscriptions",
+        State.SKIPPED,
+        "may not publish there, or may not read",
+    ),
+    ("topic write #\ntopic readwrite pebble/doctor/#", "refused subscriptions", State.WARN, "then delivers nothing"),
+]
+#: A fault, the probe that finds it, and words of what it tells.
+FAULTS = [
+    (DropsWills, "will", "none is published"),
+    further(LateWills, "will", "s after the connection is reset"),
+    (HidesRetained, "rights", "without the retain flag"),
+    (Doubles, "overlapping filters", "2 copies"),
+    (Floods, "rights", "without end"),
+    further(Mute, "answers to pings", "does not answer"),
+    (EagerPongs, "answers to pings", "before it has passed on what came before"),
+    (SendsBack, "bridge mode", "own messages come back"),
+]
+
+PATIENCE_S = 1.5  # what does not come is waited for so long
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
+    broker = Broker(tmp_path_factory.mktemp("broker"), "set_tcp_nodelay true")
+    yield broker
+    broker.stop()
+
+
+def found(port: int, name: str, restart: Callable[[], bool] | None = None) -> CheckResult:
+    """The result of one probe, after the first, on which all build; nothing is left behind."""
+    probes: list[Probe] = [RIGHTS, *(probe for probe in OTHERS if probe.name == name)]
+    with reached(MqttSettings(host="127.0.0.1", port=port), "pebble/doctor", restart) as trial:
+        trial.patience_s = PATIENCE_S
+        *_, (_, last) = run(probes, trial)
+    assert list(trial.left) == []
+    return last
+
+
+@pytest.mark.parametrize(("lines", "name", "level", "words"), SETTINGS)
+def test_what_settings_and_rules_of_mosquitto_take_away(
+    lines: str, name: str, level: State, words: str, tmp_path: Path
+) -> None:
+    (tmp_path / "acl").write_text(f"{lines}\n")
+    are_rules = lines.startswith("topic ")
+    broker = Broker(tmp_path, f"acl_file {tmp_path / 'acl'}" if are_rules else lines)
+    finding = found(broker.port, name)
+    broker.stop()
+    assert (finding.state, words in finding.text) == (level, True), finding
+    assert are_rules or finding.fix.startswith("in mosquitto.conf: ")
+
+
+@pytest.mark.parametrize(("fault", "name", "words"), FAULTS)
+def test_a_fault_of_a_broker_is_found_and_named(fault: type[Fault], name: str, words: str, sound: Broker) -> None:
+    with closing(FaultyBroker(sound.port, fault)) as broker:
+        finding = found(broker.port, name)
+    assert (finding.state in (State.WARN, State.FAILED), words in finding.text) == (True, True), finding
+
+
+def test_a_sound_broker_passes(sound: Broker) -> None:
+    with reached(MqttSettings(host="127.0.0.1", port=sound.port), "pebble/doctor") as trial:
+        results = [result for probe, result in run(PROBES, trial) if probe.name not in NEED_MORE]
+    assert [result for result in results if result.state is not State.OK] == []
+    assert list(trial.left) == []
+
+
+@pytest.mark.parametrize(
+    ("persistence", "steps", "level"),
+    [
+        (False, ("stop", "start"), State.WARN),
+        further(True, ("stop", "start"), State.OK),
+        (False, (), State.SKIPPED),  # a person pressed Enter, and did not restart it
+    ],
+)
+def test_what_a_broker_forgets_at_a_restart_is_named(
+    persistence: bool, steps: tuple[str, ...], level: State, tmp_path: Path
+) -> None:
+    broker = Broker(tmp_path, persistence=persistence)
+
+    def restart() -> bool:
+        for step in steps:
+            getattr(broker, step)()
+        return True
+
+    finding = found(broker.port, "retained, after a restart", restart)
+    broker.stop()
+    assert finding.state is level, finding
