@@ -13,7 +13,7 @@ make long PART=stops      400 random schedules of people, stops, scripts and fau
 make long PART=soak       floods, kills, freezes, full disks and more while an operator drives; MINUTES=30 for each transport
 make long PART=schedules  random schedules in virtual time, an hour
 make long PART=page       every state, card, interruption and finger at the operator page in Chromium, 25 minutes
-make long PART=engines    drive and stop a robot at the page in Firefox and WebKitGTK, and a demo in Firefox and Chromium, ten minutes
+make long PART=engines    drive and stop a robot at the page in Firefox and WebKitGTK, and a demo in Firefox, ten minutes
 make long PART=looks      store anew how the page looks, for PART=page to compare; look at the pictures, a minute
 make long PART=fleet      brokers and hubs that are killed, hung and cut off under driven robots and 300 boards, 16 minutes
 make long PART=brokers    install NATS, RabbitMQ and aedes where possible, test robots with them, judge them, seven minutes
@@ -32,7 +32,7 @@ stops | soak | schedules | fleet | brokers | gstreamer | life | lowest) debian m
 page) debian mosquitto=mosquitto chromium=chromium ;;
 looks) debian chromium=chromium ;;
 engines)
-    debian mosquitto=mosquitto firefox-esr=firefox-esr WebKitWebDriver=webkit2gtk-driver Xvfb=xvfb chromium=chromium
+    debian mosquitto=mosquitto firefox-esr=firefox-esr WebKitWebDriver=webkit2gtk-driver Xvfb=xvfb
     PATH=$PATH:/sbin ldconfig -p | grep -q libavcodec.so || debian =libavcodec-extra # Firefox has H.264 from it
     ;;
 esac

@@ -6,9 +6,9 @@ import json
 import select
 import shutil
 import subprocess
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +48,7 @@ def evaluate(imports: dict[str, str], steps: str, given: Any = None) -> Any:
     node = _evaluator()
     assert node.stdin is not None
     assert node.stdout is not None
-    node.stdin.write(json.dumps({"source": "\n".join(lines), "given": given}) + "\n")
+    node.stdin.write(json.dumps("\n".join(lines)) + "\n")
     node.stdin.flush()
     if not select.select([node.stdout], [], [], _TIMEOUT_S)[0]:
         node.kill()
@@ -66,9 +66,9 @@ def _imported(path: str, names: str, query: str = "") -> str:
 
 @dataclass(frozen=True)
 class Script:
-    """Steps that have the same modules and the same ``before`` them; ``after`` may give ``result`` its usual value.
+    """Rows that have the same modules and the same steps ``before`` theirs; ``after`` may give ``result`` its value.
 
-    ``anew``: the modules keep a state, and are new for each row of a table.
+    ``anew``: the modules keep a state, and are new for each row.
     """
 
     imports: dict[str, str]
@@ -76,25 +76,33 @@ class Script:
     after: str = ""
     anew: bool = False
 
-    def __call__(self, steps: str, given: Any = None) -> Any:
-        return evaluate(self.imports, f"{self.before}{steps}\n{self.after}", given)
+    def results(self, table: Rows) -> list[Callable[[], Any]]:
+        """Return what each row leads to. The first that is asked for runs all in one thread: to start it takes long."""
 
-    def each(self, all_steps: Sequence[str]) -> list[dict[str, Any]]:
-        """The value, or the error, of each of these steps: all in one thread, since to start one takes longest."""
-        functions = [self._function(steps, f"?row={number}" * self.anew) for number, steps in enumerate(all_steps)]
-        steps = f"""result = [];
-for (const row of [{", ".join(functions)}]) {{
-  process.removeAllListeners("uncaughtException");
-  result.push(await row().catch((error) => ({{ error: String(error?.stack ?? error) }})));
-}}"""
-        answers: list[dict[str, Any]] = evaluate({}, steps)
-        return answers
+        @cache
+        def answers() -> list[dict[str, Any]]:
+            functions = [self._function(steps, f"?row={n}" * self.anew) for n, (steps, _) in enumerate(table.values())]
+            found: list[dict[str, Any]] = evaluate({}, f"const rows = [{', '.join(functions)}];\n{_EACH}")
+            return found
+
+        def result(number: int) -> Any:
+            answer = answers()[number]
+            assert "error" not in answer, answer["error"]
+            return answer.get("value")
+
+        return [partial(result, number) for number in range(len(table))]
 
     def _function(self, steps: str, query: str) -> str:
         imports = "\n".join(_imported(path, names, query) for path, names in self.imports.items())
-        return (
-            f"async () => {{ {imports}\nlet result;\n{self.before}{steps}\n{self.after}\nreturn {{ value: result }}; }}"
-        )
+        body = f"{imports}\nlet result;\n{self.before}{steps}\n{self.after}"
+        return f"async () => {{ {body}\nreturn {{ value: result }}; }}"
+
+
+_EACH = """result = [];
+for (const row of rows) {
+  process.removeAllListeners("uncaughtException");
+  result.push(await row().catch((error) => ({ error: String(error?.stack ?? error) })));
+}"""
 
 
 def rows(*tables: tuple[Script, Rows]) -> pytest.MarkDecorator:
@@ -104,21 +112,6 @@ def rows(*tables: tuple[Script, Rows]) -> pytest.MarkDecorator:
         [
             pytest.param(found, expected, id=name)
             for script, table in tables
-            for (name, (_, expected)), found in zip(table.items(), _results(script, table), strict=True)
+            for (name, (_, expected)), found in zip(table.items(), script.results(table), strict=True)
         ],
     )
-
-
-def _results(script: Script, table: Rows) -> list[Callable[[], Any]]:
-    """What all rows of a table lead to: the first that is asked for evaluates all."""
-
-    @cache
-    def answers() -> list[dict[str, Any]]:
-        return script.each([steps for steps, _ in table.values()])
-
-    def result(number: int) -> Any:
-        answer = answers()[number]
-        assert "error" not in answer, answer["error"]
-        return answer.get("value")
-
-    return [lambda number=number: result(number) for number in range(len(table))]  # type: ignore[misc]

@@ -1,4 +1,4 @@
-"""Browsers behind the same interface: Firefox by WebDriver BiDi, WebKitGTK by its WebDriver, Chromium by Playwright."""
+"""Browsers behind the same interface: Firefox by WebDriver BiDi, WebKitGTK by its WebDriver."""
 
 from __future__ import annotations
 
@@ -19,13 +19,23 @@ from typing import Any
 import pytest
 from websockets.sync.client import ClientConnection, connect
 
-from tests.ext.page.browser import Tab, chromium, tab
-from tests.ext.page.fingers import Fingers
 from tests.support import Child, free_port, listening, until
 
 #: Keys that a character cannot name, as WebDriver has them (W3C WebDriver, 17.4.2).
 KEYS = {"Escape": "\ue00c", "Enter": "\ue007", "Control": "\ue009", "Meta": "\ue03d", "Space": " "}
 SIZE = (1280, 800)
+#: Of a Firefox that asks no other host for anything, and knows fingers.
+QUIET = {
+    "app.update.enabled": False,
+    "browser.shell.checkDefaultBrowser": False,
+    "browser.startup.homepage_override.mstone": "ignore",
+    "datareporting.policy.dataSubmissionEnabled": False,
+    "dom.w3c_touch_events.enabled": 1,
+    "network.captive-portal-service.enabled": False,
+    "network.connectivity-service.enabled": False,
+    "services.settings.server": "http://127.0.0.1:1",
+    "toolkit.telemetry.enabled": False,
+}
 _WAIT_S = 60.0
 
 
@@ -50,17 +60,12 @@ class Engine(ABC):
         """Wait until an expression is true; assert on the result."""
         return until(lambda: self.evaluate(f"Boolean({expression})"), timeout)
 
-    def press(self, chord: str, times: int = 1) -> None:
-        """Press keys together, such as "Control+Enter", some times in quick succession."""
+    def press(self, chord: str, times: int = 1, ms: int = 0) -> None:
+        """Press keys together, such as "Control+Enter", for some milliseconds; some times in quick succession."""
         codes = [KEYS.get(key, key) for key in chord.split("+")]
         keys: list[dict[str, Any]] = [{"type": "keyDown", "value": code} for code in codes]
-        keys += [{"type": "keyUp", "value": code} for code in reversed(codes)]
+        keys += [{"type": "pause", "duration": ms}, *({"type": "keyUp", "value": code} for code in reversed(codes))]
         self.perform([{"type": "key", "id": "keys", "actions": [*keys, {"type": "pause", "duration": 100}] * times}])
-
-    def hold(self, key: str, ms: int) -> None:
-        """Hold a key for some milliseconds."""
-        steps = [{"type": "keyDown", "value": key}, {"type": "pause", "duration": ms}, {"type": "keyUp", "value": key}]
-        self.perform([{"type": "key", "id": "keys", "actions": steps}])
 
     def click(self, selector: str, hold_ms: int = 0, pointer: str = "mouse") -> None:
         """Press the middle of an element with the mouse or by "touch", once it is shown and rests."""
@@ -89,14 +94,10 @@ class Firefox(Engine):
 
     name = "Firefox"
 
-    def __init__(self, connection: ClientConnection) -> None:
+    def __init__(self, connection: ClientConnection, width: int, height: int) -> None:
         self._connection, self._numbers = connection, itertools.count(1)
         self._send("session.new", capabilities={})
         self._context = self._send("browsingContext.create", type="tab")["context"]
-        self.resize(*SIZE)
-
-    def resize(self, width: int, height: int) -> None:
-        """Give the page this many CSS pixels."""
         viewport = {"width": width, "height": height}
         self._send("browsingContext.setViewport", context=self._context, viewport=viewport)
 
@@ -169,55 +170,11 @@ class WebKit(Engine):
         return value
 
 
-class Chromium(Engine):
-    """Debian's Chromium, with a finger as its only pointer."""
-
-    name = "Chromium"
-
-    def __init__(self, opened: Tab) -> None:
-        self.tab, self._page, self._finger = opened, opened.page, Fingers(opened)
-
-    def open(self, url: str) -> None:
-        self._page.goto(url)
-
-    def evaluate(self, expression: str) -> Any:
-        return self._page.evaluate(f"async () => ({expression})")
-
-    def perform(self, actions: list[dict[str, Any]]) -> None:
-        place = (0, 0)
-        for step in itertools.chain.from_iterable(source["actions"] for source in actions):
-            match step["type"]:
-                case "pause":
-                    self._page.wait_for_timeout(step["duration"])
-                case "keyDown":
-                    self._page.keyboard.down(step["value"])
-                case "keyUp":
-                    self._page.keyboard.up(step["value"])
-                case "pointerMove":
-                    place = step["x"], step["y"]
-                case "pointerDown":
-                    self._finger.down(0, *place)
-                case "pointerUp":
-                    self._finger.lift()
-
-
 @contextmanager
-def chromium_with_finger(width: int, height: int) -> Iterator[Chromium]:
-    """A Chromium whose page has this many CSS pixels; a narrow one is a phone's."""
-    size = {"width": width, "height": height}
-    phone = width < 600
-    with (
-        chromium() as browser,
-        tab(browser, "about:blank", engineers=False, viewport=size, has_touch=True, is_mobile=phone) as opened,
-    ):
-        yield Chromium(opened)
-
-
-@contextmanager
-def firefox(folder: Path, preferences: Mapping[str, object]) -> Iterator[Firefox]:
-    """A Firefox with a new profile in ``folder``."""
+def firefox(folder: Path, size: tuple[int, int] = SIZE) -> Iterator[Firefox]:
+    """A Firefox with a new profile in ``folder``, whose page has this many CSS pixels."""
     program = shutil.which("firefox-esr") or pytest.skip("no Firefox: apt install firefox-esr")
-    lines = [f"user_pref({json.dumps(key)}, {json.dumps(value)});\n" for key, value in preferences.items()]
+    lines = [f"user_pref({json.dumps(key)}, {json.dumps(value)});\n" for key, value in QUIET.items()]
     (folder / "user.js").write_text("".join(lines))
     command = [program, "--headless", "--no-remote", "--profile", str(folder), "--remote-debugging-port", "0"]
     with running(command, folder / "output") as output:
@@ -226,11 +183,11 @@ def firefox(folder: Path, preferences: Mapping[str, object]) -> Iterator[Firefox
         match = found()
         assert match is not None
         with connect(f"{match[1]}/session", max_size=None, open_timeout=30, ping_interval=None) as connection:
-            yield Firefox(connection)
+            yield Firefox(connection, *size)
 
 
 @contextmanager
-def webkit(folder: Path, language: str) -> Iterator[WebKit]:
+def webkit(folder: Path) -> Iterator[WebKit]:
     """WebKitGTK's browser on a screen that nobody sees, with everything that it stores in ``folder``."""
     browsers = sorted(Path("/usr/lib").glob("*/webkit2gtk-4.*/MiniBrowser"))
     if not browsers or not shutil.which("WebKitWebDriver") or not shutil.which("Xvfb"):
@@ -241,7 +198,7 @@ def webkit(folder: Path, language: str) -> Iterator[WebKit]:
         number = stack.enter_context(running(screen, folder / "display"))
         assert until(lambda: number.read_text().endswith("\n"), 20), "Xvfb did not start"
         homes = {name: str(folder) for name in ("HOME", "XDG_DATA_HOME", "XDG_CACHE_HOME", "XDG_CONFIG_HOME")}
-        environment = {**os.environ, **homes, "DISPLAY": f":{number.read_text().strip()}", "LC_ALL": language}
+        environment = {**os.environ, **homes, "DISPLAY": f":{number.read_text().strip()}", "LC_ALL": "C"}
         environment |= {"NO_AT_BRIDGE": "1", "LIBGL_ALWAYS_SOFTWARE": "1"}
         driver = ["WebKitWebDriver", "--host=127.0.0.1", f"--port={port}"]
         stack.enter_context(running(driver, folder / "driver", environment))

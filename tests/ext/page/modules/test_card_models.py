@@ -1,4 +1,4 @@
-"""What is behind the cards Lights, Sounds and Autonomy, without a browser: in Node.js."""
+"""What is behind the cards of a robot, without a browser: in Node.js."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from collections.abc import Callable
 from typing import Any
 
 from pebble.extensions.operator.client.forms import Setting
+from tests.ext.boards import mcu_wire as wire
 from tests.ext.page.in_node import Rows, Script, evaluate, rows
+from tests.ext.page.states import described
 
 _STORED = """
 const stored = new Map();
@@ -52,9 +54,7 @@ const lit = () => [one.mode, one.colour];
 """
 #: What is asked of lights, and what is sent.
 ASKED = {
-    '{ mode: "solid" }': ORANGE,
     '{ colour: "#0000ff" }': {"r": 0, "g": 0, "b": 1},
-    '{ mode: "flash", period: 0.5 }': ORANGE | {"period": 0.5},
     '{ mode: "flash", period: 99 }': ORANGE | {"period": 10},
     '{ mode: "flash", period: NaN }': ORANGE | {"period": 2},
     '{ mode: "off" }': BLACK,
@@ -62,31 +62,18 @@ ASKED = {
 }
 NO_FLASH = "goob has no lights that flash"
 WHY_NO_FLASH = {
-    "page.connection.isOpen = false": "No connection to the server",
-    'values[""]["web/broker"].problem = "refused"': "The server cannot reach the broker",
-    "page.connection.may = () => false": "Log in as driver to use this",
-    'values[ref]["web/liveness"].online = false': "goob is silent",
     "values[ref].capabilities.value.lights.controls = false": "goob takes no such commands",
     "values[ref].capabilities.value.lights.flash = false": NO_FLASH,
-    "values[ref].capabilities = null": NO_FLASH,
     "delete values[ref]": NO_FLASH,
 }
-#: Sections of capabilities, and whether such lights stay on, and flash.
-ABLE = {
-    "{ solid: true, flash: true }": [True, True],
-    "{ solid: true, flash: false }": [True, False],
-    "{ available: true }": [True, True],
-    "{ available: true, flash: false }": [True, False],
-    '{ solid: "yes", available: 1 }': [False, False],
-    "{}": [False, False],
-}
-REMEMBERED = "null", "7", '"x"', "[]", '{"colour":"url(x)","period":"2","mode":"boom","steady":[]}'
+ODD = '{"colour":"url(x)","period":"2","mode":"boom","steady":[]}'
 # fmt: off
 LIGHTS: Rows = {
     "a dragged colour is sent now and at last": ("""
-        const one = lightsOf(ref);
+        const one = lightsOf(ref), timers = [];
+        globalThis.setTimeout = (fn) => timers.push(fn);
         for (let blue = 10; blue < 30; blue++) one.ask(page, { colour: `#0000${blue}` });
-        await new Promise((resolve) => setTimeout(resolve, 300));
+        timers.forEach((fn) => fn());
         result = sent.map(({ b }) => b);""", [0.063, 0.161]),
     **{f"what is asked of lights: {change}": (f"lightsOf(ref).ask(page, {change}); result = sent;", [expected])
         for change, expected in ASKED.items()},
@@ -124,13 +111,13 @@ LIGHTS: Rows = {
         result = [toggleFlash(page, ref), one.mode, toggleFlash(page, ref)];""", ["", "off", "goob is silent"]),
     **{f"why lights do not flash: {change}": (f"{change}; result = [toggleFlash(page, ref), sent];", [why, []])
         for change, why in WHY_NO_FLASH.items()},
-    **{f"what lights can do: {section}": (f"""
-        const {{ solid, flash }} = supported({{ value: {{ lights: {section} }} }});
-        result = [solid, flash];""", expected) for section, expected in ABLE.items()},
-    **{f"lights ignore what they cannot have remembered: {found}": (f"""
-        globalThis.localStorage = {{ getItem: () => {json.dumps(found)}, setItem() {{}} }};
-        const {{ colour, period, mode, steady }} = new Lights("other");
-        result = [colour, period, mode, steady];""", ["#ff8800", 2, "", "off"]) for found in REMEMBERED},
+    "what lights can do": ("""
+        result = [{ solid: true }, { available: true, flash: false }, { solid: "yes", available: 1 }].map(
+          (lights) => Object.values(supported({ value: { lights } })));""",
+        [[True, False], [True, False], [False, False]]),
+    "lights ignore what they cannot have remembered": (f"""
+        globalThis.localStorage = {{ getItem: () => {json.dumps(ODD)}, setItem() {{}} }};
+        result = Object.values(new Lights("other").state);""", ["#ff8800", 2, "", "off"]),
 }
 # fmt: on
 
@@ -144,7 +131,6 @@ GROUPS = [
     ("", 60, [["", FILES[:2]], ["animals/", FILES[2:4]], WILD], 0),
     ("CAT", 60, [["animals/", FILES[2:3]], WILD], 0),
     ("  wild   cat ", 60, [WILD], 0),
-    ("nothing", 60, [], 0),
     ("", 2, [["", FILES[:2]]], 3),
 ]
 # fmt: off
@@ -167,7 +153,7 @@ SOUNDS: Rows = {
 # -- forms of scripts
 
 forms = Script(
-    {"ui/cards/form-model.js": "filled, hint, moreWords, remember, remembered, scripts"},
+    {"ui/cards/form-model.js": "filled, hint, remember, remembered, scripts"},
     _STORED,
 )
 
@@ -178,40 +164,29 @@ def entry(key: str, kind: Any = "string", **more: Any) -> dict[str, Any]:
 
 ALL = [
     entry("name", default="goob"),
-    entry("laps", "int", default=3, min=1, max=9, step=1),
     entry("power", "float", default=0.5, min=0.1, max=1.0),
     entry("search", "bool", default=True),
-    entry("family", "enum", default="A", options=["A", "B"]),
     entry("tag", "int", required=True),
 ]
-GIVEN = {"name": "naïve café", "laps": "4", "power": "0.25", "search": "false", "family": "B", "tag": "0", "other": "x"}
-SENT = {"name": "naïve café", "laps": 4, "power": 0.25, "search": False, "family": "B", "tag": 0}
+GIVEN = {"name": "naïve café", "power": "0.25", "search": "false", "tag": "0", "other": "x"}
+SENT = {"name": "naïve café", "power": 0.25, "search": False, "tag": 0}
 HINTS = [
     (entry("a", "int", min=1, max=9, default=3), "A whole number from 1 to 9"),
     (entry("a", "float", min=0.5), "A number, at least 0.5"),
     (entry("a", "float", max=2, default=1.5), "A number, at most 2"),
-    (entry("a", "int"), "A whole number"),
-    (entry("a", "bool", default=False), ""),
     (entry("a"), ""),
 ]
-LISTED = {"files": [{"file": "x", "configs": [one | {"key": f"k{n}"} for n, (one, _) in enumerate(HINTS)]}]}
-SAME = ["Follow (a)", "Follow (b)", "Go"]
-#: Payloads, and the labels of the scripts that they list.
-LABELS = {
-    **dict.fromkeys(("undefined", "{}"), None),
-    '{ files: [{ file: "a", label: "Follow", configs: [] }, { file: "b", label: "Follow", configs: [] }, '
-    '{ file: "c", label: "Go", configs: [] }] }': SAME,
-}
-NOT_STORED = "{", "7", '{"a":1}', '[[1,2,3],["goob","a",{"x":1}],["goob","a",[["x",1]]],null]'
+NOT_STORED = '[[1,2,3],["goob","a",{"x":1}],["goob","a",[["x",1]]],null]'
 # fmt: off
 FORMS: Rows = {
     "what was filled in is sent in the types of JSON": (f"""
         result = [{{ tag: "7" }}, {json.dumps(GIVEN)}].map(
           (texts) => filled({json.dumps(ALL)}, new Map(Object.entries(texts))));""", [{"tag": 7}, SENT]),
-    "hints": (
-        f"result = scripts({json.dumps(LISTED)})[0].fields.map(hint);", [expected for _, expected in HINTS]),
-    **{f"the scripts of {payload}": (f"result = scripts({payload})?.map((one) => one.label);", labels)
-        for payload, labels in LABELS.items()},
+    "hints": (f"result = {json.dumps([one for one, _ in HINTS])}.map(hint);", [expected for _, expected in HINTS]),
+    "scripts of one label have their files behind": ("""
+        const named = (file, label) => ({ file, label, configs: [] });
+        result = scripts({ files: [named("a", "Follow"), named("b", "Follow"), named("c", "Go")] })
+          .map((one) => one.label);""", ["Follow (a)", "Follow (b)", "Go"]),
     "three settings come first, those that a script names, and what must be filled in": ("""
         const configs = ["a", "b", "c", "d"].map((key) => ({ key }));
         configs.push({ key: "e", required: true, default: null });
@@ -219,11 +194,6 @@ FORMS: Rows = {
           const [one] = scripts({ files: [{ file: "x", configs, main }] });
           return [one.main, one.more].map((fields) => fields.map(({ key }) => key).join("")).join(" ");
         });""", ["abce d", "cbe ad", "abce d", "edc ab"]),
-    "what else there is": ("""
-        const [{ more }] = scripts({ files: [{ file: "x", configs: ["a", "b", "c", "d"].map((key) => ({ key })) }] });
-        const words = (fields, texts) => moreWords(fields, new Map(texts));
-        result = [words(more, []), words([...more, ...more], []), words(more, [["d", "1"]])];
-        """, ["1 more option", "2 more options", "1 more option, 1 changed"]),
     "forms are remembered by robot and script": ("""
         remember("goob", "a", new Map([["x", "1"]]));
         remember("goob", "b", new Map([["x", "2"]]));
@@ -234,9 +204,8 @@ FORMS: Rows = {
         for (let n = 0; n < 40; n++) remember("goob", `script ${n}`, new Map([["x", "y".repeat(200)]]));
         result = [JSON.parse(stored.get("pebble forms")).length, texts(remembered("goob", "script 39")).x.length];""",
         [32, 200]),
-    **{f"a memory of something else is none: {found}": (f"""
-        stored.set("pebble forms", {json.dumps(found)});
-        result = texts(remembered("goob", "a"));""", {}) for found in NOT_STORED},
+    "a memory of something else is none": (f"""
+        stored.set("pebble forms", {json.dumps(NOT_STORED)}); result = texts(remembered("goob", "a"));""", {}),
 }
 # fmt: on
 
@@ -248,28 +217,45 @@ SERVER, BROKER, DRIVER, MAINTAINER = (
     "Log in as driver to use this",
     "Log in as maintainer to use this",
 )
-may = Script({"ui/parts/why-not.js": "whyNot, whyNotEnd", "ui/parts/parts.js": "isGone"}, _PAGE)
+may = Script(
+    {
+        "ui/cards/autonomy-model.js": "whyNotStarted",
+        "ui/parts/why-not.js": "whyNot, whyNotEnd",
+        "ui/parts/parts.js": "isGone",
+    },
+    _PAGE,
+)
 #: What ends something may be asked of a silent robot: why it, what a driver and what a maintainer does may not.
 WHYS = {
     "": ["", "", MAINTAINER],
-    "page.connection.may = () => true": ["", "", ""],
     "page.connection.may = () => false": [DRIVER, DRIVER, MAINTAINER],
     'values[ref]["web/liveness"].online = false': ["", "goob is silent", MAINTAINER],
     'values[""]["web/broker"].problem = "x"': ["", BROKER, MAINTAINER],
     'values[""]["web/broker"].connected = false': [BROKER] * 3,
     "page.connection.isOpen = false": [SERVER] * 3,
 }
+BOB = 'values[ref]["web/driver"] = { by: "bob", you: %s, idle_s: %s }'
+WHY_NOT_STARTED = {
+    'values[ref]["web/liveness"].online = null': "goob has not been seen yet",
+    'values[ref]["web/estop"] = { latched: true, by: "eve" }': "Stopped by eve",
+    "values[ref].capabilities.value.autonomy.controls = false": "goob takes no such commands",
+    BOB % ("false", "null"): "",
+    BOB % ("false", "null") + "; drive.arbitrates = false": "bob is driving",
+    BOB % ("true", "null") + '; drive.arbitrates = "yes"': "You are driving",
+    BOB % ("false", "0.1") + "; drive.arbitrates = false": "",
+}
 #: The age of a value and its usual period in seconds, and whether its robot is online and the value gone.
 GONE = [
-    (9, 1, True, False),
     (11, 1, True, True),
     (11, 5, True, False),
-    (16, 5, True, True),
     (99, 0, True, False),
     (0, 1, False, True),
 ]
 # fmt: off
 MAY: Rows = {
+    **{f"why no script can be started: {change}": (f"""
+        const {{ drive }} = values[ref].capabilities.value; {change}; result = whyNotStarted(page, ref);""", why)
+        for change, why in WHY_NOT_STARTED.items()},
     **{f"what may be asked: {change}": (
         f'{change}; result = [whyNotEnd(page), whyNot(page, ref), whyNot(page, ref, "", "system")];', whys)
         for change, whys in WHYS.items()},
@@ -284,39 +270,66 @@ def test_the_newest_answers_are_remembered_by_the_number_of_the_command() -> Non
     steps = """
     const connection = new Connection("v");
     const answer = (n, op) => connection.answered({ op, cmd: "outlet", ref: "a", n, why: "no" });
-    answer(1, "refused");
-    answer(2, "done");
-    result = [connection.answers.get(1).op, connection.answers.get(2).op];
-    for (let n = 3; n <= 500; n++) answer(n, "done");
+    for (let n = 1; n <= 500; n++) answer(n, "done");
     answer(0, "refused");
-    result.push(connection.answers.size, connection.answers.has(500), connection.answers.has(300));"""
-    assert evaluate({"ui/parts/models.js": "Connection"}, steps) == ["refused", "done", 200, True, False]
+    const { answers } = connection;
+    result = [answers.get(500).op, answers.size, answers.has(300)];"""
+    assert evaluate({"ui/parts/models.js": "Connection"}, steps) == ["done", 200, False]
 
 
-autonomy = Script({"ui/cards/autonomy-model.js": "whyNotStarted"}, _PAGE)
-BOB = 'values[ref]["web/driver"] = { by: "bob", you: %s, idle_s: %s }'
-WHY_NOT_STARTED = {
-    "": "",
-    "page.connection.may = () => false": DRIVER,
-    'values[ref]["web/liveness"].online = false': "goob is silent",
-    'values[ref]["web/liveness"].online = null': "goob has not been seen yet",
-    'values[ref]["web/estop"] = { latched: true, by: "eve" }': "Stopped by eve",
-    "values[ref].capabilities.value.autonomy.controls = false": "goob takes no such commands",
-    BOB % ("false", "null"): "",
-    BOB % ("false", "null") + "; drive.arbitrates = false": "bob is driving",
-    BOB % ("true", "null") + '; drive.arbitrates = "yes"': "You are driving",
-    BOB % ("false", "0.1") + "; drive.arbitrates = false": "",
-}
-# fmt: off
-AUTONOMY: Rows = {
-    **{f"why no script can be started: {change}": (f"""
-        const {{ drive }} = values[ref].capabilities.value; {change}; result = whyNotStarted(page, ref);""", why)
-        for change, why in WHY_NOT_STARTED.items()},
-}
-# fmt: on
+# -- manifests of microcontrollers, what a robot offers, and outlets
+
+cards = Script(
+    {
+        "core/stream.js": "refusal",
+        "ui/cards/manifest.js": "command, range, step, unsendable",
+        "ui/cards/outlets.js": "outletsOf, obstacle",
+        "ui/parts/models.js": "Offers",
+    }
+)
 
 
-stream = Script({"core/stream.js": "refusal"})
+def of(expression: str, *values: Any) -> str:
+    """Steps: what ``expression`` makes of ``v``, the ``values``."""
+    return f"const v = {json.dumps(values)}; result = {expression};"
+
+
+PRIVATE = wire.M("m", (wire.I(1, "a", wire.IN, wire.KIND_COMMAND, (wire.F("x", wire.U8),), flags=wire.LOCAL_ONLY),))
+#: Fields, what is entered, and the value of the field's type.
+ENTERED: list[tuple[dict[str, Any], Any, Any]] = [
+    ({"type": "bool"}, True, True),
+    ({"type": "bool"}, None, False),
+    ({"type": "f32"}, "1.5e3", 1500),
+]
+#: Fields, and the least and the greatest value, and the step.
+RANGES: list[tuple[dict[str, Any], Any, str]] = [
+    ({"type": "u8"}, [0, 255], "1"),
+    ({"type": "u8", "scale": 0.5}, [0, 127.5], "0.5"),
+    ({"type": "i16", "scale": -0.1, "offset": 10}, [-3266.7, 3286.8], "any"),
+    ({"type": "f32"}, None, "any"),
+]
+#: What capabilities list of *drive*, and whether there are controls for an axis besides turning and going.
+AXES: list[tuple[Any, bool]] = [
+    ({"drive": {"available": True, "axes": ["x", "z"]}}, False),
+    ({"drive": {"available": True}}, True),  # it does not list them: it may have any
+    (None, True),  # no capabilities
+]
+OFFERED = {"value": {"outlets": {"available": True, "outlets": [{"name": "o1", "controls": False}, {"name": "o2"}]}}}
+#: Capabilities, metrics, and the outlets, and whether each can be switched.
+OUTLETS: list[tuple[Any, list[str], dict[str, bool]]] = [
+    (OFFERED, ["outlets/o1/status", "outlets/o9/status"], {"o1": False, "o2": True, "o9": False}),
+    (None, ["outlets/o1/status", "outlets/o1/other", "outlets/x"], {"o1": True}),
+]
+NOT_TOPIC = "its name cannot be part of a topic"
+#: Names of outlets, whether they can be switched, what they report, and why they cannot be switched on.
+OBSTACLES: list[tuple[str, bool, dict[str, Any], str]] = [
+    ("o1", True, {"bound": True, "reachable": True, "on": False}, ""),
+    ("o1", True, {"reachable": False}, "outlet is unreachable"),
+    ("o1", True, {"bound": False, "reachable": False}, "no device is bound to this outlet"),
+    ("o1", False, {}, "this outlet cannot be switched from here: its robot lists no control"),
+    ("a/b", True, {}, NOT_TOPIC),
+    ("x" * 65, True, {}, NOT_TOPIC),
+]
 PAGE = "{ protocol: 'https:', hostname: 'lab.local' }"
 #: Addresses of a robot's own stream, and why they are not shown in a page that came by https from lab.local.
 STREAMS = {
@@ -330,14 +343,31 @@ STREAMS = {
     ),
 }
 # fmt: off
-STREAM: Rows = {
-    f"why no stream is shown of {address[:40]}": (
+CARDS: Rows = {
+    "an interface that stays on the robot takes no commands": (
+        of("unsendable(v[0].interfaces[0]).slice(0, 22)", described(PRIVATE)), "it takes commands from"),
+    **{f"controls for an extra axis: {value}": (
+        of("new Offers('pebble/robots/a', v[0]).hasExtraAxis", value and {"value": value}), expected)
+        for value, expected in AXES},
+    **{f"outlets are those that are listed and those that report: {metrics}": (of("""Object.fromEntries(
+        outletsOf(new Offers('pebble/robots/a', v[0], v[1])).map(({ name, controls }) => [name, controls]))""",
+        capabilities, metrics), expected) for capabilities, metrics, expected in OUTLETS},
+    **{f"what is entered becomes JSON of the field's type: {field} {entered}": (of(
+        "command(v[0], new Map(v[1])).x", {"encoding": {"fields": [field | {"name": "x"}]}}, [["x", entered]]), value)
+        for field, entered, value in ENTERED},
+    **{f"what a field can hold: {field}": (of("[range(v[0]), step(v[0])]", field), [limits, step])
+        for field, limits, step in RANGES},
+    **{f"why {name[:8]} {controls} {report} cannot be switched": (
+        of("obstacle(...v)", name, controls, report, True), why) for name, controls, report, why in OBSTACLES},
+    "an outlet that reports a fault can be switched off":
+        ("result = obstacle('o1', true, { bound: false }, false);", ""),
+    **{f"why no stream is shown of {address[:40]}": (
         f"result = refusal({json.dumps(address)}, {PAGE}).slice(0, {len(why) or 99});", why)
-    for address, why in STREAMS.items()
+        for address, why in STREAMS.items()},
 }
 # fmt: on
 
 
-@rows((stream, STREAM), (lights, LIGHTS), (sounds, SOUNDS), (forms, FORMS), (may, MAY), (autonomy, AUTONOMY))
+@rows((lights, LIGHTS), (sounds, SOUNDS), (forms, FORMS), (may, MAY), (cards, CARDS))
 def test_each(found: Callable[[], Any], expected: Any) -> None:
     assert found() == expected

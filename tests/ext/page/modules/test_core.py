@@ -1,10 +1,12 @@
-"""The page's driving modules: gestures, inputs, and the reasons why a control is off; in Node.js."""
+"""Gestures, inputs, the reasons why a control is off, and what else keys and gamepads do; in Node.js."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
 from typing import Any
+
+import pytest
 
 from pebble.extensions.operator.client.drive_reasons import WORDS
 from tests.ext.page.in_node import STATIC, Rows, Script, evaluate, rows
@@ -32,7 +34,6 @@ GESTURE: Rows = {
         [[1, 0.5, False], [1, 0.5, False], [1, 0, False], [1, 0, False], [1, 0, False]]),
     "a change is sent sooner but not at once after another":
         ("step(0.5); step(0.6, { wait: 10 }); step(0.7, { wait: 15 });", [[1, 0.5, False], [1, 0.7, False]]),
-    "without a gesture nothing is sent": ("quiet(20);", []),
     "an interruption is final": (
         "step(0.5); gesture.interrupt(now); step(0.5); step(0.5); result = sent.slice(1);", [[1, 0, True]] * 3),
     "an interruption holds until everything is released": (
@@ -69,8 +70,7 @@ _INPUTS = """
 const inputs = new Inputs();
 const full = { speed: 1, turn: 1, balance: 0 };
 const vector = (sliders = full) => { const { x, z, y } = inputs.vector(sliders); return [x + 0, z + 0, y + 0]; };
-const pad = (x, z, timestamp = 1, buttons = []) =>
-  ({ id: "pad", axes: [x, -z], buttons: [0, 1].map((i) => ({ pressed: buttons.includes(i) })), timestamp });
+const pad = (x, z, timestamp = 1) => ({ id: "pad", axes: [x, -z], buttons: [], timestamp });
 const seen = (...pads) => pads.forEach((one, i) => inputs.padSample(one, 1000 + 50 * i));
 """
 
@@ -81,24 +81,19 @@ inputs = Script({"core/inputs.js": "Inputs, balanced"}, _INPUTS)
 #: Keys that are held, and what they ask for.
 KEYS = {
     "KeyW": [0, 1, 0],
-    "ArrowDown": [0, -1, 0],
     "KeyA": [-1, 0, 0],
-    "ArrowRight": [1, 0, 0],
-    "KeyW ArrowUp": [0, 1, 0],
     "KeyW KeyS": [0, 0, 0],
     "KeyW KeyD": [0.5, 0.5, 0],
-    "KeyQ": [0, 0, 1],
     "KeyE": [0, 0, -1],
     "KeyX": [0, 0, 0],
 }
-INTERRUPTIONS = "inputs.clear()", "inputs.leave()", "inputs.padGone()", "seen(null)"
 # fmt: off
 INPUTS: Rows = {
     **{keys: (f"'{keys}'.split(' ').forEach((one) => inputs.keyDown(one)); result = vector();", expected)
         for keys, expected in KEYS.items()},
     **{f"a gamepad has to be seen in neutral again after {one}": (
         f"seen(pad(0, 0), pad(0, 1, 2)); {one}; seen(pad(0, 1, 3)); result = vector();", [0, 0, 0])
-        for one in INTERRUPTIONS},
+        for one in ("inputs.clear()", "seen(null)")},
     "sliders scale and balance": ("""
         inputs.keyDown("KeyW", false); result = [vector({ speed: 0.5, turn: 1, balance: 0 })];
         result.push(vector({ speed: 1, turn: 1, balance: -1 })); inputs.leave();
@@ -137,9 +132,6 @@ INPUTS: Rows = {
     "a button moves the auxiliary axis while it is held": (
         'inputs.hold("up", 1); result = [vector()]; inputs.hold("up", 0); result.push(vector());',
         [[0, 0, 1], [0, 0, 0]]),
-    "a gamepad counts after it was seen in neutral": (
-        "seen(pad(0, 1)); result = [vector()]; seen(pad(0, 0, 2), pad(0, 1, 3)); result.push(vector());",
-        [[0, 0, 0], [0, 1, 0]]),
     "a gamepad whose time stands still is not believed for long": ("""
         inputs.padSample(pad(0, 0), 0); inputs.padSample(pad(0, 1, 2), 50);
         inputs.padSample(pad(0, 1, 2), 3000); result = [vector(), inputs.padFrozen];
@@ -150,8 +142,6 @@ INPUTS: Rows = {
     "a gamepad that never was in neutral is no frozen one": ("""
         inputs.padSample(pad(0, 1), 0); inputs.padSample(pad(0, 1), 10_000);
         result = [vector(), inputs.padFrozen];""", [[0, 0, 0], False]),
-    "the second button of a gamepad chooses the auxiliary axis":
-        ("seen(pad(0, 0), pad(-1, 0, 2, [1])); result = vector();", [0, 0, -1]),
     "keys and gamepad need the focus and the stick does not": ("""
         inputs.stickStart(1); inputs.stickMove(0, 1); result = [inputs.fromKeys];
         inputs.keyDown("KeyW", false); result.push(inputs.fromKeys); inputs.keyUp("KeyW");
@@ -183,78 +173,58 @@ const mends = [
 """
 
 
-reasons = Script({"core/reasons.js": "driveReason, offReason"}, _SITUATION + f"situation.words = {json.dumps(WORDS)};")
-
-
-def test_the_first_reason_counts() -> None:
-    found = reasons("result = mends.map((mend) => driveReason(Object.assign(situation, mend)));")
-    assert [None if one is None else one["code"] for one in found] == [
-        "server", "broker", "reload", "plain", "role", "hidden", "silent", "stopped", "reset", "no-drive", "lease",
-        "itself", "dialog", "script", "picture", "late", "pad", "focus", "release", "release", None,
-    ]  # fmt: skip
-    texts = {
-        "server": "No connection to the server",
-        "silent": "goob is silent for 12 s",
-        "stopped": "Stopped by eve",
-        "lease": "bob (phone) is driving",
-        "itself": "Take control to drive",
-        "picture": "The picture is 2.4 s old",
-        "late": "Commands are late (640 ms)",
-        "release": "Let go first",
-    }
-    assert {one["code"]: one["text"] for one in reversed(found) if one and one["code"] in texts} == texts
-    assert found[-2]["text"] == "Let go first. It was: Commands are late"
-    actions = {one["code"]: one["action"]["kind"] for one in found if one is not None and "action" in one}
-    expected = {"reload": "reload", "role": "login", "lease": "take-over", "itself": "take", "picture": "see"}
-    assert actions == expected | {"script": "stop-script"}
-
-
-_GOOD = "mends.forEach((mend) => Object.assign(situation, mend));"
+#: Afterwards all is well.
+_ALL = f"""situation.words = {json.dumps(WORDS)};
+const all = mends.map((mend) => driveReason(Object.assign(situation, mend)));"""
+reasons = Script({"core/reasons.js": "driveReason"}, _SITUATION + _ALL)
 #: What is different while all is well, and why it is off then.
 LIMITS = {
     "{ liveness: { online: null, silent_s: null } }": None,
     "{ liveness: undefined }": "silent",
     "{ capabilities: { drive: { available: true, controls: false } } }": "no-drive",
     "{ loading: true }": "loading",
-    "{ pictureAgeMs: 1900, inSight: false }": None,
     "{ pictureAgeMs: null, inSight: false }": None,
     "{ pictureAgeMs: Infinity, inSight: false }": "picture",
     "{ pictureAgeMs: -1, inSight: false }": "picture",
-    "{ pictureAgeMs: -1, inSight: true }": None,
     "{ focus: false, fromKeys: false }": None,
 }
 #: Of a driver and of further rights: why it is off, and what is offered.
 KEPT = {
     ("{}", "[]"): ["lease", "bob (phone) has control", "ask", None],
-    ("{}", "['take']"): ["lease", "bob (phone) has control", "ask", "take-over"],
     ("{ asking: true }", "['take']"): ["asked", "bob (phone) is asked for control", "give-up", "take-over"],
     ("{ by: '', device: '', asking: true }", "['take']"): ["free", "Take control to drive", "take", None],
 }
 #: Of a script that runs.
 DRIVES = {
-    "file: 'april-follow'": "april-follow is driving: stop it first",
     "file: 'april-follow', label: 'Follow a tag'": "Follow a tag is driving: stop it first",
     "file: 'x'.repeat(1000)": f"{'x' * 40} is driving: stop it first",
-    "file: null": "A script is driving: stop it first",
     "file: 'wheel-odometry', drives: false": None,
 }
 STOPS = {"label": "Stop script", "kind": "stop-script"}
 # fmt: off
 REASONS: Rows = {
+    "the first reason counts": ("result = all.map((one) => one?.code ?? null);", [
+        "server", "broker", "reload", "plain", "role", "hidden", "silent", "stopped", "reset", "no-drive", "lease",
+        "itself", "dialog", "script", "picture", "late", "pad", "focus", "release", "release", None]),
+    "a reason says more where that helps": (
+        "result = [6, 10, 14, 15, 19].map((at) => all[at].text);",
+        ["goob is silent for 12 s", "bob (phone) is driving", "The picture is 2.4 s old", "Commands are late (640 ms)",
+         "Let go first. It was: Commands are late"]),
+    "what can be done against a reason": (
+        "result = Object.fromEntries(all.filter((one) => one?.action).map(({ code, action }) => [code, action.kind]));",
+        {"reload": "reload", "role": "login", "lease": "take-over", "itself": "take", "picture": "see",
+         "script": "stop-script"}),
     **{f"limits of reasons: {change}": (
-        f"{_GOOD} result = driveReason({{ ...situation, ...{change} }})?.code ?? null;", code)
+        f"result = driveReason({{ ...situation, ...{change} }})?.code ?? null;", code)
         for change, code in LIMITS.items()},
-    **{f"who drives a robot that keeps control is asked: {change} {rights}": (f"""{_GOOD}
+    **{f"who drives a robot that keeps control is asked: {change} {rights}": (f"""
         const driver = {{ by: "bob", device: "phone", you: false, keeps: true, ...{change} }};
         const found = driveReason({{ ...situation, driver, rights: ["drive", ...{rights}] }});
         result = [found.code, found.text, found.action.kind, found.also?.kind ?? null];""", expected)
         for (change, rights), expected in KEPT.items()},
     **{f"a script that drives can be stopped: {script}": (
-        f"{_GOOD} result = driveReason({{ ...situation, script: {{ running: true, {script} }} }});",
+        f"result = driveReason({{ ...situation, script: {{ running: true, {script} }} }});",
         text and {"code": "script", "text": text, "action": STOPS}) for script, text in DRIVES.items()},
-    "without server or broker everything is off": (
-        "result = mends.map((mend) => offReason(Object.assign(situation, mend))?.code ?? null).slice(0, 4);",
-        ["server", "broker", None, None]),
 }
 # fmt: on
 
@@ -272,24 +242,140 @@ def test_a_stop_by_request_has_the_name_of_the_person() -> None:
     assert evaluate({"core/estop.js": "Estop", "core/browser.js": "ROOT"}, steps) == ["/api/estop?name=Ann%20%26%20Bo"]
 
 
-def test_the_sound_socket_has_the_name_and_device_of_the_person() -> None:
-    steps = """
-      const urls = [];
-      const WebSocket = class { constructor(url) { urls.push(url); } };
-      Object.assign(globalThis, { self: {}, location: { origin: "http://here" }, WebSocket });
-      await import(given);
-      self.onmessage({ data: { op: "open", ref: "a/b/c", port: null, name: "Ann & Bo", device: "phone" } });
-      result = Object.fromEntries(new URL(urls[0]).searchParams);
-    """
-    worker = (STATIC / "media" / "sound-worker.js").as_uri()
-    assert evaluate({}, steps, worker) == {"ref": "a/b/c", "can": "", "name": "Ann & Bo", "device": "phone"}
+# -- actions: what is done is listed as [action, phase]
+
+_ACTIONS = """
+const done = [];
+let open = true;
+const actions = new Actions((id, phase) => done.push([id, phase]), () => open);
+const usual = { x: { axis: 0, invert: false }, z: { axis: 1, invert: true }, buttons: {} };
+const key = (code, { key = code, repeat = false } = {}) => actions.keyDown({ code, key, repeat });
+const pad = (...pressed) => ({
+  id: "pad", index: 0, axes: [0, 0], buttons: Array.from({ length: 16 }, (_, i) => ({ pressed: pressed.includes(i) })),
+});
+const seen = (...pads) => pads.forEach((one) => actions.padSample(one, usual));
+"""
 
 
-def test_what_rounds_to_zero_has_no_sign() -> None:
-    steps = "result = [[-0.04, 1], [-0.06, 1], [0, 2], [-0.4, 0], [-10, 0], ['a', 1]].map((one) => number(...one));"
-    assert evaluate({"ui/parts/words.js": "number"}, steps) == ["0.0", "-0.1", "0.00", "0", "-10", "–"]
+actions = Script(
+    {"core/actions.js": "Actions, ACTIONS, keyName, buttonName"}, _ACTIONS, "await null;\nresult ??= done;"
+)
 
 
-@rows((gesture, GESTURE), (inputs, INPUTS), (reasons, REASONS))
+#: What is pressed, and the action.
+PRESSES = {
+    'key("KeyF")': "flash",
+    'key("Minus", { key: "?" })': "help",  # on a German keyboard
+    'key("KeyM", { key: "?" })': "help",  # on a French keyboard
+    'key("KeyM", { key: "," })': "mute",  # there, too
+}
+# fmt: off
+ACTIONS: Rows = {
+    **{f"what {press} does": (press, [[action, "down"]]) for press, action in PRESSES.items()},
+    "what is held ends once when its key is released": ("""
+        key("KeyT"); key("KeyT", { repeat: true }); actions.keyUp("KeyF"); actions.keyUp("KeyT");
+        actions.keyUp("KeyT");""", [["talk", "down"], ["talk", "up"]]),
+    "what is held ends with a gesture and a repetition does not begin it again": (
+        'key("KeyT"); actions.clear(); key("KeyT", { repeat: true }); actions.keyUp("KeyT"); key("KeyF");',
+        [["talk", "down"], ["talk", "up"], ["flash", "down"]]),
+    "only the speed is repeated":
+        ('key("NumpadAdd", { key: "+", repeat: true }); key("KeyF", { repeat: true });', [["faster", "down"]]),
+    "on the fleets screen there is only the help": (
+        'open = false; key("KeyT"); key("KeyF"); seen(pad(), pad(3)); key("Slash", { key: "?" });',
+        [["help", "down"]]),
+    "an action that fails keeps nothing else from being done": ("""
+        const failing = new Actions(() => { throw new Error("no"); });
+        process.on("uncaughtException", () => {});
+        failing.keyDown({ code: "KeyT", key: "t", repeat: false });
+        failing.clear();
+        result = "went on";""", "went on"),
+    "the buttons of a gamepad act when they are pressed": (
+        "seen(pad(), pad(3), pad(3), pad(), pad(4), pad(5), pad(12), pad(13));",
+        [[one, "down"] for one in ("flash", "mute", "repeat", "faster", "slower")]),
+    "talking lasts as long as its button is held":
+        ("seen(pad(), pad(6), pad(6), pad());", [["talk", "down"], ["talk", "up"]]),
+    **{f"talking by gamepad ends with what ends a gesture: {end}": (
+        f"seen(pad(), pad(6)); {end}; seen(pad(6), pad(6));", [["talk", "down"], ["talk", "up"]])
+        for end in ("seen(null)", "actions.clear()", "seen({ ...pad(6), index: 1 })")},
+    "other keys have none":
+        ('result = [key("KeyX"), key("Slash", { key: "/" }), key("KeyW"), key("Space")];', [False] * 4),
+    "a button that is pressed when a gamepad appears does nothing":
+        ("seen(pad(3), pad(3), pad(), null, pad(3), pad(3));", []),
+    "a mapping moves an action to another button":
+        ("usual.buttons = { flash: 7, mute: -1 }; seen(pad(), pad(3, 4), pad(7));", [["flash", "down"]]),
+    "every binding is in the table once, and none is a stop's": ("""
+        const keys = ACTIONS.flatMap((one) => one.keys ?? []), buttons = ACTIONS.flatMap((one) => one.button ?? []);
+        result = [new Set(keys).size - keys.length, new Set([...buttons, 8, 9]).size - buttons.length];""", [0, 2]),
+    "keys are named as they are printed": ("""
+        const azerty = new Map([["KeyW", "z"]]); result = [keyName("KeyW", azerty), keyName("KeyW"),
+        keyName("ArrowUp", azerty), buttonName(3, true), buttonName(3, false)];""", ["Z", "W", "↑", "Y", "button 4"]),
+}
+# fmt: on
+
+
+# -- mappings of gamepads
+
+_MAPPING = """
+const swapped = { x: { axis: 3, invert: true }, z: { axis: 2, invert: false }, buttons: { auxiliary: 5, stop: 2 } };
+const pad = (axes, ...pressed) =>
+  ({ axes, buttons: Array.from({ length: 8 }, (_, i) => ({ pressed: pressed.includes(i) })) });
+const seen = (pad, mapping = swapped) => Object.values(padVector(pad, mapping) ?? {});
+"""
+
+
+mapping = Script({"core/inputs.js": "USUAL, padVector"}, _MAPPING)
+
+
+# fmt: off
+MAPPING: Rows = {
+    **{f"a mapping has the axes and their directions: {pushed}": (f"result = seen(pad({pushed}));", expected)
+        for pushed, expected in {
+            "[1, 1, 1, 0]": [0, 1, 0], "[1, 1, 0, 1]": [-1, 0, 0], "[0, 0, 0, -1], 5": [0, 0, 1],
+            "[0, 0, 0.15, 0.15]": [0, 0, 0],  # within the dead zone
+            "[0, 0, 0.575, -0.575]": [pytest.approx(0.5), pytest.approx(0.5), 0],
+        }.items()},
+    "the usual one has the first two axes": ("result = seen(pad([1, -1, 0, 0]), USUAL);", [1, 1, 0]),
+    "axes that are no numbers are none": ('result = seen(pad([0, 0, NaN, "1"]));', []),
+}
+# fmt: on
+
+
+# -- what is joined to the page later; ``later`` runs what it does each second
+
+_MORE = """
+const define = (name, value) => Object.defineProperty(globalThis, name, { value, configurable: true });
+let dialog = null;
+let later;
+const seen = [];
+define("location", { search: "" });
+define("document", {
+  querySelector: () => dialog, createElement: () => ({}), head: { append() {} }, addEventListener() {},
+  documentElement: { toggleAttribute() {} },
+});
+const lock = { released: false, release() { seen.push("off"); this.released = true; } };
+const request = async () => (seen.push("on"), Object.assign(lock, { released: false }));
+define("navigator", { wakeLock: { request } });
+define("setInterval", (run) => (later = run));
+const { install } = await import(given);
+const driver = { ref: "pebble/robots/goob", lease: {}, onChange() {} };
+const panels = { toggle: (name) => seen.push(name) };
+const page = { driver, connection: { show() {} }, store: { get: () => undefined }, panels, commands: {} };
+install(page);
+page.sound = { toggleMute: () => seen.push("mute") };
+const key = (code, key = code) => driver.actions.keyDown({ code, key, repeat: false });
+const turn = () => new Promise((resolve) => setImmediate(resolve));
+"""
+
+
+def test_behind_an_open_panel_there_is_only_the_help_and_the_screen_stays_on_while_this_page_has_control() -> None:
+    steps = """key("KeyM"); dialog = {}; key("KeyM"); key("Slash", "?"); await turn();
+    page.connection.isOpen = true; let you = false; page.store.get = () => ({ value: { you } });
+    for (you of [false, true, true, false, false, true]) { later(); await turn(); }
+    lock.released = true; later(); await turn(); result = seen;"""
+    module = (STATIC / "ui" / "more.js").as_uri()
+    assert evaluate({}, _MORE + steps, module) == ["mute", "help", "on", "off", "on", "on"]
+
+
+@rows((gesture, GESTURE), (inputs, INPUTS), (reasons, REASONS), (actions, ACTIONS), (mapping, MAPPING))
 def test_each(found: Callable[[], Any], expected: Any) -> None:
     assert found() == expected

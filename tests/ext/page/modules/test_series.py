@@ -1,4 +1,4 @@
-"""What the page has of a metric over time, what it plots of it, and the trail of its odometry; in Node.js."""
+"""Values over time: series, plots, the trail of an odometry, the page's store, and recordings; in Node.js."""
 
 from __future__ import annotations
 
@@ -22,30 +22,24 @@ run = Script(_MODULES, _PREPARED)
 
 #: What the numbers of a payload are.
 NUMBERS = {
-    "7": {"value": 7},
     "{ value: 7.9, unit: 'v', t: 5 }": {"value": 7.9},
     "{ value: { a: 1, b: { c: 2, d: { e: 3, f: { g: 4 } } } } }": {"a": 1, "b.c": 2, "b.d.e": 3},
     "{ t: 1, seq: 2, speed: 3 }": {"speed": 3},
     "{ value: [1, 'x', 2] }": {"0": 1, "2": 2},
-    **dict.fromkeys(("{ value: null }", "{ value: NaN }", "{ value: Infinity }", "null", "'7'"), None),
+    **dict.fromkeys(("{ value: null }", "{ value: Infinity }", "'7'"), None),
     "{ value: { ['x'.repeat(61)]: 1 } }": None,
     'JSON.parse(\'{"value": {"__proto__": 1, "constructor": 2}}\')': {"__proto__": 1, "constructor": 2},
 }
 #: Where a payload says that something is.
 PLACES = {
     "{ value: { x_mm: 1500, y_mm: -500, heading_rad: 0.5 }, unit: 'mm' }": [1.5, -0.5, 0.5],
-    "{ value: { x: 1.5, y: -0.5, theta_rad: 0.5 }, unit: 'm' }": [1.5, -0.5, 0.5],
-    "{ value: { x: 1500, y: -500, heading: 0.5 } }": [1.5, -0.5, 0.5],
+    "{ value: { x: 1.5, y: -0.5, theta_rad: 0.5 }, unit: 'M' }": [1.5, -0.5, 0.5],
     "{ value: { x: 150, y: -50, yaw_rad: 0.5, unit: 'cm' } }": [1.5, -0.5, 0.5],
     "{ x_m: 1.5, y_m: -0.5, z_m: 0, yaw_rad: 0.5 }": [1.5, -0.5, 0.5],
     "{ value: { x_mm: 0, y_mm: 0, heading_deg: 180 } }": [0, 0, 3.14159],
-    "{ value: { x_mm: 0, y_mm: 0 } }": [0, 0, 0],
     "{ value: { x: 1500, y: 0 }, unit: { toString: 0 } }": [1.5, 0, 0],
 }
-NO_PLACES = (
-    *("null", "7", "[]", "{}", "{ value: [1, 2] }", "{ value: { x_mm: '1', y_mm: 2 } }"),
-    *("{ value: { x_mm: 1e300, y_mm: 0 } }", "{ value: { x: {} }, unit: { toString: 0 } }"),
-)
+NO_PLACES = "null", "{ value: [1, 2] }", "{ value: { x_mm: '1', y_mm: 2 } }", "{ value: { x_mm: 1e300, y_mm: 0 } }"
 _POSES = """
 const pose = (x, run = -1) => ({ x, y: 0, heading: 0, run });
 const cut = (times, poses) => trail.pieces(times, poses).map((piece) => piece.map(({ x }) => x));
@@ -106,6 +100,177 @@ RUN: Rows = {
 # fmt: on
 
 
-@rows((run, RUN))
+# -- the newest values, their ages and periods, subscriptions, and the server's clock
+
+_STORE = """
+let now = 1000;
+const waiting = [];
+const store = new Store(() => now, (fn) => waiting.push(fn));
+const frame = () => waiting.splice(0).forEach((fn) => fn());
+const calls = [];
+"""
+store = Script({"core/store.js": "Store"}, _STORE)
+# fmt: off
+STORE: Rows = {
+    "a value ages from its age at the server": (
+        'store.set("a", "m", 7, 400); now += 100; const v = store.get("a", "m"); result = [v.value, v.age];',
+        [7, 500]),
+    "subscribers of a metric are called once for many changes": ("""
+        store.subscribe("a", "m", () => calls.push("m"));
+        store.subscribe("b", "m", () => calls.push("b"));
+        store.set("a", "m", 1); store.set("a", "m", 2); store.set("a", "n", 1); frame();
+        const first = [...calls]; store.set("a", "m", 3); frame();
+        result = [first, calls];""", [["m"], ["m", "m"]]),
+    "a metric of any component is noticed, also that it goes": ("""
+        store.subscribe(null, "m", () => calls.push(store.refs().join()));
+        store.set("a", "m", 1); store.set("b", "m", 1); frame();
+        store.set("a", "n", 1); frame();
+        store.drop("b", "m"); frame();
+        store.remove("a"); frame();
+        result = calls;""", ["a,b", "a,b", "b"]),
+    "a subscriber that fails keeps no other from being called": ("""
+        process.on("uncaughtException", (error) => calls.push(error.message));
+        store.subscribe("a", "m", () => { throw new Error("bad"); });
+        store.subscribe("b", "m", () => calls.push("b"));
+        store.set("a", "m", 1); store.set("b", "m", 2); frame();
+        await new Promise((done) => setTimeout(done, 1));
+        result = calls;""", ["b", "bad"]),
+    "a subscription ends": ("""
+        const end = store.subscribe("a", "m", () => calls.push("m"));
+        end(); store.set("a", "m", 1); frame(); result = calls;""", []),
+    "components and new metrics are noticed": ("""
+        store.subscribe(null, null, () => calls.push(store.refs().join()));
+        store.subscribe("a", null, () => calls.push(store.metrics("a").join(" ")));
+        store.set("", "web/broker", {}); store.set("a", "m", 1); frame();
+        store.set("a", "m", 2); frame();
+        store.set("a", "n", 2); frame();
+        store.remove("a"); frame();
+        result = calls;""", ["a", "m", "m n", "", ""]),
+    "the period is the usual time between updates": ("""
+        const periods = [];
+        for (const wait of [0, 200, 210, 190, 5000, 200]) {
+          now += wait; store.set("a", "m", 1); periods.push(store.get("a", "m").period);
+        }
+        result = periods;""", [0, 0, 0, 200, 210, 200]),
+    "late messages do not set the clock back": ("""
+        store.sync(50_000, 20); const prompt = store.now();
+        now += 500; store.sync(50_500 - 300, 20); const late = store.now();
+        result = [prompt, late];""", [50_010, 50_510]),
+    "a clock that was set is followed": ("""
+        store.sync(50_000, 0);
+        for (let i = 0; i < 60; i++) { now += 500; store.sync(20_000 + now, 0); }
+        result = store.now() - now;""", 20_000),
+}
+# fmt: on
+
+
+# -- recordings: where a player is, what it sends, and the day around it
+
+#: A feed with a clock that only ``now`` moves, and a socket that notes what is asked for.
+FEED = """
+globalThis.WebSocket = class { static OPEN = 1; };
+const it = { now: 0, sent: [], begun: 0, taken: [], media: [], sockets: [] };
+const open = (path) => {
+  const socket = { path, readyState: 1, send: (text) => it.sent.push(JSON.parse(text)), close() {} };
+  it.sockets.push(socket);
+  return socket;
+};
+const feed = new Feed("a/b/c", {
+  clock: () => it.now, open, changed() {}, begin: () => it.begun++, take: (message) => it.taken.push(message.op),
+  picture: (payload, at, shown) => it.media.push([[...payload], at, shown]),
+  sound: (payload) => it.media.push([...payload]),
+});
+const hear = (message) => it.sockets.at(-1).onmessage({ data: typeof message === "object" && !(message instanceof
+  ArrayBuffer) ? JSON.stringify(message) : message });
+const played = (at, more = {}) => hear({ op: "played", at, on: false, speed: 1, ...more });
+const medium = (what, at) => {
+  const view = new DataView(new ArrayBuffer(11));
+  view.setUint8(0, what); view.setFloat64(1, at); view.setUint8(9, 7); view.setUint8(10, 255);
+  hear(view.buffer);
+};
+const opened = () => { feed.seek(5000); it.sockets[0].onopen(); played(5000, { begins: true }); };
+"""
+feed = Script({"core/replay/feed.js": "Feed"}, FEED + "result = (() => {", "})();")
+timeline = Script(
+    {"core/replay/timeline.js": "extentOf, firstOf, stretchesOf, stretchOf, startOf, whyOf"},
+    """const start = startOf("2026-11-22");
+    const day = (activity, sessions = []) => ({ from: start, step: 10_000, activity, gaps: [], outages: [], sessions });
+    const steps = ({ since, until }) => [(since - start) / 10_000, (until - start) / 10_000];""",
+)
+# fmt: off
+PLAYED: Rows = {
+    "the first seek opens the socket there, and what follows goes on from it": ("""
+        opened(); return [it.sockets[0].path, it.begun, feed.position, feed.seeking, feed.seeks];""",
+        ["ws/replay?robot=a%2Fb%2Fc&at=5000", 1, 5000, False, 1]),
+    "the time goes on by itself for a second at its speed": ("""
+        opened(); played(5000, { on: true, speed: 4 }); it.now = 500; const soon = feed.position; it.now = 9000;
+        return [soon, feed.position];""", [7000, 9000]),
+    "of many seeks the first and the last are asked for": ("""
+        opened(); for (let n = 1; n <= 50; n++) feed.seek(1000 * n);
+        const before = feed.position; played(1000, { begins: true }); const still = feed.seeking;
+        played(50_000, { begins: true });
+        return [it.sent.map((op) => op.at), before, still, feed.seeking, it.begun];""",
+        [[1000, 50_000], 50_000, True, False, 2]),
+    "what was sent before a seek arrives is void": ("""
+        opened(); feed.seek(9000); medium(1, 5100); hear({ op: "state", now: 5100, set: [] }); played(5100);
+        const during = [it.media.length, it.taken.length, feed.position];
+        played(9000, { begins: true }); medium(1, 8990); hear({ op: "state", now: 9000, set: [] });
+        return [during, it.media, it.taken];""", [[0, 0, 9000], [[[7, 255], 8990, True]], ["state"]]),
+    "pictures for the decoder are not shown, and sound is sound": ("""
+        opened(); medium(0, 1); medium(1, 2); medium(2, 3); return it.media;""",
+        [[[7, 255], 1, False], [[7, 255], 2, True], [7, 255]]),
+    "a stretch that was left out is shown for a while": ("""
+        opened(); played(9000, { skipped: [6000, 9000] }); const { since, until } = feed.skipped; it.now = 5000;
+        played(9100); const still = Boolean(feed.skipped); it.now = 7000; played(9200);
+        return [since, until, still, feed.skipped];""", [6000, 9000, True, None]),
+    "a lost socket is made anew where it was, as it was": ("""
+        globalThis.setTimeout = (fn) => { it.later = fn; };
+        opened(); played(6000, { on: true, speed: 2 }); it.sockets[0].onclose(); it.later(); it.sockets[1].onopen();
+        return [it.sockets[1].path, it.sent];""",
+        ["ws/replay?robot=a%2Fb%2Fc&at=6000", [{"op": "speed", "speed": 2}, {"op": "play", "on": True}]]),
+    "what the server refuses is not asked again": ("""
+        globalThis.setTimeout = () => { throw new Error("again"); };
+        opened(); hear({ op: "bye", why: "too many", again: false }); it.sockets[0].onclose(); return feed.problem;""",
+        "too many"),
+    "it may only seek, play and change the speed": ("""
+        opened(); feed.seek(1); feed.play(true); feed.setSpeed(8); feed.setSpeed(3);
+        return it.sent.map((op) => op.op);""", ["seek", "play", "speed"]),
+}
+TIMELINE: Rows = {
+    "a day is seen from its first to its last message": ("""
+        result = [steps(extentOf(day([0, 0, 1, 0, 32]), "2026-11-22")), steps(extentOf(day([]), "2026-11-22"))];""",
+        [[2, 5], [0, 8640]]),
+    "what happened is in stretches, and only what is seen": ("""
+        const all = day([2, 2, 0, 2, 64, 2, 0, 0, 2]), seen = (since, until) => ({ since: start + since, until: start +
+          until });
+        result = [stretchesOf(all, 2, seen(0, 90_000)).map(steps), stretchesOf(all, 2, seen(25_000, 45_000)).map(steps),
+          stretchesOf(all, 2, seen(0, 7_000_000)).map(steps)];""",
+        [[[0, 2], [3, 4], [5, 6], [8, 9]], [[3, 4]], [[0, 6], [8, 9]]]),
+    "a day begins where it has pictures": ("""
+        const sessions = [{ since: start + 15_000, until: start + 30_000 }, { since: start + 60_000, until: start +
+          75_000 }];
+        const first = (steps, last) =>
+          (firstOf({ timeline: day(steps, sessions), name: "2026-11-22" }, last) - start) / 10_000;
+        result = [first([1, 1, 65, 1]), first([1, 1, 1, 1]), first([1, 1, 1, 1], true),
+          first([1, 65, 1, 1, 1, 1, 65, 65], true), first([1, 1, 1, 1, 1, 1, 1, 65]), first([64, 1, 64, 64, 1]),
+          firstOf({ timeline: null, name: "2026-11-22" }) - start];""",
+        [3, 1.5, 6, 7, 7.5, 3, 0]),
+    "a gap has the reason that the recorder wrote down": ("""
+        const gaps = [{ since: 5, until: 9, why: "disk" }];
+        result = [whyOf(gaps, { since: 8, until: 20 }), whyOf(gaps, { since: 9, until: 20 })];""", ["disk", ""]),
+    **{f"with marks at {since} and {until} is exported at {at}": (f"""
+        const stretch = stretchOf({since}, {until}, [{{ since: 100, until: 200 }}], {at});
+        result = [stretch.since, stretch.until];""", expected)
+        for since, until, at, expected in (
+            ("null", "null", 150, [100, 200]),  # the session
+            ("null", "null", 500, [500, 60_500]),  # a minute
+            (120, "null", 150, [120, 200]),
+            ("null", 180, 150, [100, 180]),
+        )},
+}
+# fmt: on
+
+
+@rows((run, RUN), (store, STORE), (feed, PLAYED), (timeline, TIMELINE))
 def test_each(found: Callable[[], Any], expected: Any) -> None:
     assert found() == expected

@@ -1,11 +1,21 @@
-"""The page's microphone, its talks, the worker of sound and its decoder, with a browser that is made up; in Node.js."""
+"""Sound on the page: microphone and talks, its worker, buffers and resampler; in Node.js, with a made-up browser."""
 
 from __future__ import annotations
 
+import random
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+import pytest
+
+from pebble.extensions.media.jitter import JitterBuffer
+from pebble.extensions.media.packets import Codec, Sound
+from pebble.extensions.media.pcm import Resampler
+from pebble.extensions.media.speech import Speech
+from tests.ext.media.test_jitter import play
 from tests.ext.page.in_node import STATIC, Rows, Script, evaluate, rows
+from tests.support import cases
 
 # -- the microphone and talks: a question of the browser is answered by ``answer()`` or ``answer(error)``
 
@@ -81,10 +91,6 @@ sound = Script({"ui/robot/sound-model.js": "Sound", "core/store.js": "Store"}, _
 
 # fmt: off
 MICROPHONE: Rows = {
-    "a microphone that is opened twice at a time is opened once": ("""
-        const both = [microphone.open(), microphone.open()]; await turn();
-        result = [questions.length]; await answer(); result.push(await Promise.all(both), streams.length);
-        microphone.close(); result.push(open().length, sources);""", [1, ["", ""], 1, 0, 0]),
     "a microphone that cannot be joined is given back and the next attempt begins anew": ("""
         broken = "source"; const first = microphone.open(); await turn(); await answer();
         result = [await first, open().length];
@@ -146,37 +152,26 @@ SOUND: Rows = {
 # -- the worker
 
 
-def test_a_page_that_stood_still_learns_that_its_talk_has_ended() -> None:
+def test_the_socket_has_the_name_of_the_person_and_a_page_that_stood_still_learns_that_its_talk_has_ended() -> None:
     steps = """const define = (name, value) => Object.defineProperty(globalThis, name, { value, configurable: true });
-    const said = [];
+    const said = [], urls = [];
     define("self", { postMessage: (message) => said.push(message) });
     define("location", { origin: "http://127.0.0.1" });
-    define("WebSocket", class { static OPEN = 1; });
+    define("WebSocket", class { static OPEN = 1; constructor(url) { urls.push(url); } });
     let now = 0;
     performance.now = () => now;
     await import(given);
-    self.onmessage({ data: { op: "open", ref: "pebble/robots/goob", port: null, rate: 48_000 } });
+    self.onmessage({ data: { op: "open", ref: "a/b/c", port: null, rate: 48_000, name: "Ann & Bo", device: "phone" } });
     const port = { close() {} };
     self.onmessage({ data: { op: "talk", talk: 3, rate: 16_000, port } });
     const feed = () => port.onmessage({ data: new Float32Array(1024) });
-    feed(); now = 900; feed(); result = [said.length]; now = 1100; feed(); result.push(said);"""
+    feed(); now = 900; feed(); result = [said.length]; now = 1100; feed();
+    result.push(said, Object.fromEntries(new URL(urls[0]).searchParams));"""
     worker = (STATIC / "media" / "sound-worker.js").as_uri()
     assert evaluate({}, steps, worker) == [
         0, [{"answer": {"talk": 3, "on": False, "why": "The page stood still: talk again"}}],
+        {"ref": "a/b/c", "can": "", "name": "Ann & Bo", "device": "phone"},
     ]  # fmt: skip
-
-
-def test_more_sound_than_was_asked_for_is_left_out_and_given_back() -> None:
-    steps = """let output; let given_back = 0;
-    globalThis.AudioDecoder = class { constructor(parts) { output = parts.output; } configure() {} };
-    const packets = [];
-    const decoder = new OpusDecoder((packet) => packets.push(packet), () => {});
-    decoder.decoder = decoder.open(1);
-    output({ close: () => (given_back += 1) });
-    decoder.pending = [{ sound: {}, left: 1, parts: [], rate: 0 }];
-    try { output({ close: () => (given_back += 1), numberOfFrames: -1 }); } catch {}
-    result = [given_back, packets.length];"""
-    assert evaluate({"media/opus.js": "OpusDecoder"}, steps) == [2, 0]
 
 
 def test_the_lead_at_the_loudspeaker_grows_when_the_worker_is_late_and_shrinks_afterwards() -> None:
@@ -204,15 +199,122 @@ def test_the_lead_at_the_loudspeaker_grows_when_the_worker_is_late_and_shrinks_a
       }
       return Math.round(1000 * playout.lead);
     };
-    const stats = () => playout.stats().bufferedMs;
     result = [run(5)];
-    run(0.1, false);
-    run(1);
-    run(0.1, false);
-    result.push(run(1));
-    const many = stats();
-    result.push(run(60), stats() < many);"""
-    assert evaluate({"media/playout.js": "Playout"}, steps) == [20, 40, 20, True]
+    for (let i = 0; i < 2; i++) {
+      run(0.1, false);
+      run(1);
+    }
+    result.push(run(0), run(60));"""
+    assert evaluate({"media/playout.js": "Playout"}, steps) == [20, 40, 20]
+
+
+# -- buffer and resampler do exactly what those of pebble.extensions.media do, on the same packets
+
+EPOCH_MS = 1_700_000_000_000
+Arrival = tuple[float, bytes]
+
+_PLAY = """
+result = given.map(({ options, arrivals }) => {
+  const buffer = new JitterBuffer(options);
+  const chunks = [];
+  let refused = 0;
+  let now = 0;
+  for (;;) {
+    const wait = !buffer.playing && !buffer.waiting.size ? null : Math.max(0, buffer.due - now);
+    if (wait === null && !arrivals.length) break;
+    const due = wait === null ? Infinity : now + wait;
+    if (arrivals.length && arrivals[0][0] <= due) {
+      const [at, payload] = arrivals.shift();
+      now = at;
+      try {
+        const sound = unpack(new Uint8Array(Buffer.from(payload, "hex")));
+        buffer.put({ ...sound, samples: pcmOf(sound) }, now);
+      } catch { refused++; }
+      continue;
+    }
+    now = due;
+    const chunk = buffer.take(now);
+    if (chunk) chunks.push([now, chunk.rate, chunk.channels, chunk.concealed, [...chunk.samples]]);
+  }
+  return { chunks, lost: buffer.lost, refused };
+});
+"""
+
+
+def expected_of(options: dict[str, int], arrivals: list[Arrival]) -> dict[str, Any]:
+    """Does the same by pebble.extensions.media.jitter."""
+    buffer = JitterBuffer(
+        limit=options["limit"], concealment_ms=options["concealmentMs"], target_ms=options["targetMs"]
+    )
+    chunks = [
+        [at, chunk.rate, chunk.channels, chunk.concealed, chunk.samples.reshape(-1).tolist()]
+        for at, chunk in play(buffer, arrivals).chunks
+    ]
+    counters = buffer.counters
+    return {"chunks": chunks, "lost": counters["lost"] + counters["overflow"], "refused": counters["refused"]}
+
+
+def arrivals(randoms: random.Random) -> list[Arrival]:
+    """What a network, and senders that restart, may make of some seconds of sound."""
+    rate, channels = randoms.choice([(16000, 1), (16000, 2), (44100, 1), (8000, 3)])
+    jitter, loss = randoms.choice([0.001, 0.03, 0.15, 0.4]), randoms.choice([0, 0.02, 0.2])
+    noise = np.random.default_rng(randoms.randrange(1 << 30)).integers(-32768, 32768, 30_000).astype("<i2")
+    sequence = randoms.choice([1, 4_294_967_200])
+    found: list[Arrival] = []
+    at, stalled_until = 0.0, 0.0
+    for index in range(300):
+        if randoms.random() < 0.01:
+            sequence = randoms.choice([1, sequence + randoms.choice([5, 2000]), max(1, sequence - 30)])
+        if randoms.random() < 0.01:
+            stalled_until = at + randoms.uniform(0.1, 1.5)
+        if randoms.random() < 0.005:
+            rate, channels = randoms.choice([(16000, 1), (48000, 2), (rate, channels)])
+        at += 0.02 if randoms.random() > 0.01 else randoms.uniform(0, 0.8)
+        frames = rate // 50
+        start = randoms.randrange(len(noise) - frames * channels)
+        body = noise[start : start + frames * channels].tobytes()
+        ms = EPOCH_MS + 20 * index - (randoms.randrange(2000) if randoms.random() < 0.02 else 0)
+        number = (sequence - 1) % 0xFFFF_FFFF + 1
+        payload = Sound(Codec.PCM16LE, channels, rate, frames, number, ms, body).pack()
+        sequence += 1
+        for _ in range(randoms.choice([1] * 50 + [2])):
+            if randoms.random() >= loss:
+                found.append((max(at + randoms.uniform(0, jitter), stalled_until), payload))
+        if randoms.random() < 0.01:
+            found.append((at, payload[: randoms.randrange(len(payload))]))
+    return sorted(found, key=lambda one: one[0])
+
+
+@pytest.mark.parametrize("seeds", [range(first, first + 6) for first in range(0, cases(6, 200), 6)], ids=str)
+def test_the_jitter_buffer_plays_the_same_samples_at_the_same_times(seeds: range) -> None:
+    given, expected = [], []
+    for seed in seeds:
+        randoms = random.Random(seed)
+        options = {
+            "limit": randoms.choice([48, 20]),
+            "concealmentMs": randoms.choice([100, 0, 250]),
+            "targetMs": randoms.choice([61, 37, 5]),  # no multiple of a packet: sums may differ in their last bit
+        }
+        coming = arrivals(randoms)
+        given.append({"options": options, "arrivals": [[at, payload.hex()] for at, payload in coming]})
+        expected.append(expected_of(options, coming))
+    modules = {"media/jitter.js": "JitterBuffer", "media/sound-packet.js": "pcmOf, unpack"}
+    assert evaluate(modules, _PLAY, given) == expected
+
+
+@pytest.mark.parametrize(("rate", "rate_out"), [(16000, 44100), (48000, 16000)])
+def test_the_resampler_makes_the_same_samples(rate: int, rate_out: int) -> None:
+    speech = Speech(rate).samples(0, rate // 2)
+    pieces = np.array_split(speech, 23)
+    resampler = Resampler(rate, rate_out, 1)
+    expected = np.concatenate([resampler.feed(piece) for piece in pieces])[:, 0]
+    steps = f"""
+const resampler = new Resampler({rate}, {rate_out});
+result = given.flatMap((piece) => [...resampler.feed(Float32Array.from(piece))]);
+"""
+    made = evaluate({"media/resampler.js": "Resampler"}, steps, [piece[:, 0].tolist() for piece in pieces])
+    assert len(made) == len(expected)
+    assert np.abs(np.array(made) - expected).max() <= 1
 
 
 @rows((microphone, MICROPHONE), (sound, SOUND))

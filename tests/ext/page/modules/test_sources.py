@@ -60,12 +60,6 @@ def test_what_is_safety_or_media_needs_no_framework() -> None:
     assert found(imports, ((path, path.read_text()) for path in sources)) == {}
 
 
-def test_pages_ask_not_to_be_translated() -> None:
-    """Else a browser would say in other words, and late, what is so now."""
-    for path in STATIC.glob("*.html"):
-        assert '<html lang="en" translate="no" class="notranslate">' in path.read_text(), path.name
-
-
 def _imported(module: Path) -> set[Path]:
     """A module and all that it imports."""
     found, pending = {module}, [module]
@@ -108,19 +102,6 @@ def test_markup_has_no_style_of_its_own_and_one_script_whose_hash_the_policy_nam
     for path in STATIC.glob("*.html"):
         markup = path.read_text().replace("<script>{start}</script>", "")
         assert not re.search(r"<script(?![^>]*\bsrc=)|<style|\sstyle=|\son[a-z]+=", markup), path.name
-
-
-def test_style_sheets_that_are_fetched_later_do_not_restyle_each_other() -> None:
-    """They stay for good, in the order in which they came: a class alone belongs to one of them."""
-    found: dict[str, set[str]] = {}
-    for path in STATIC.glob("*.css"):
-        if path.name in ("app.css", "login.css"):
-            continue
-        rules = re.findall(r"([^{}]+)\{", re.sub(r"/\*.*?\*/", "", path.read_text(), flags=re.DOTALL))
-        for selector in ",".join(rules).split(","):
-            if name := re.fullmatch(r"\s*[a-z]*\.([\w-]+)\s*", selector):
-                found.setdefault(name[1], set()).add(path.name)
-    assert {name: sheets for name, sheets in found.items() if len(sheets) > 1} == {}
 
 
 def test_what_is_sent_is_the_same_program(tmp_path: Path) -> None:

@@ -1,20 +1,22 @@
-"""Controls of a robot's page in a browser: each opens, sends what it is for, and nothing is complained of."""
+"""Controls of the page in a browser: each opens, sends what it is for, and nothing is complained of."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
+from playwright.sync_api import Locator
 
-from tests.ext.page.browser import Tab
+from tests.ext.page.browser import Tab, answer
 from tests.ext.page.canned import CannedServer, Show, State
 from tests.ext.page.states import (
     ASKED,
     FRED,
     GOOB,
     GOOB_PATH,
-    LAMP,
     MAY_TAKE,
     MINE,
     STATES,
@@ -120,21 +122,21 @@ def test_a_form_is_sent_once_the_browser_finds_no_mistake_and_what_it_refuses_is
         opened.test("start-script").click()
         return bool(opened.page.evaluate("document.activeElement.dataset.test") == f"set-{name}")
 
-    many = [setting(f"n{number}", f"Setting {number}", "float", 0.5, min=0, max=1) for number in range(1, 6)]
-    many = [setting("n0", "Setting 0", "int", required=True, min=0, max=34), *many]
-    scripts = at(GOOB, "autonomy-files", {"files": [{"file": "follow", "main": ["n0"], "configs": many}]})
+    fields = [
+        setting("tag", "Tag", "int", required=True, min=0, max=34),
+        setting("speed", "Speed", "float", 0.5, min=0, max=1),
+    ]
+    scripts = at(GOOB, "autonomy-files", {"files": [{"file": "follow", "main": ["tag"], "configs": fields}]})
     with show(replace(STATES["asked"], values=changed(ASKED, MINE, scripts))) as opened:
         do(opened, "script-follow")
-        assert refuses("n0")  # it is required
-        do(opened, "set-n0=35")
-        assert refuses("n0")
-        do(opened, "set-n0=7")
+        assert refuses("tag")  # it is required
+        do(opened, "set-tag=7")
         do(opened, "more-settings")
-        do(opened, "set-n5=-5")
+        do(opened, "set-speed=-5")
         opened.page.evaluate("document.querySelector('.script-more').open = false")
-        assert refuses("n5")
-        do(opened, "restore-n5")
-        assert opened.test("set-n5").input_value() == "0.5"
+        assert refuses("speed")
+        do(opened, "restore-speed")
+        assert opened.test("set-speed").input_value() == "0.5"
         assert server.sent("autonomy") == []
 
 
@@ -149,24 +151,21 @@ def test_what_was_asked_is_shown_until_the_outlet_reports_it(show: Show, server:
         report["value"]["on"] = True
         assert opened.until(lambda: opened.test("outlet-o2").get_attribute("aria-checked") == "true")
         assert opened.test("outlet-asked-o2").count() == 0
-        do(opened, "outlet-o2")
-        assert opened.until(lambda: [one["on"] for one in server.sent("outlet")] == [True, False])
-
-
-STOPPED = """(refs) => refs.forEach((ref) => pebble.store.set(
-  ref, "web/estop", { ...pebble.store.get(ref, "web/estop").value, latched: true, by: "eve" }))"""
+        assert [one["on"] for one in server.sent("outlet")] == [True]
 
 
 def test_stops_are_read_aloud_whatever_comes_right_after_them(show: Show) -> None:
     with show(STATES["fleet"]) as opened:
         opened.test("bell").wait_for()
-        opened.page.evaluate(STOPPED, [FRED, LAMP])
-        opened.page.evaluate("(ref) => pebble.store.set(ref, 'web/liveness', { online: false })", GOOB)
-        announced = opened.test("announcement")
-        stops = "fred was stopped by eve. minilamp was stopped by eve"
-        assert opened.until(lambda: stops in announced.inner_text()), announced.inner_text()
-        opened.test("bell").click()
-        assert opened.until(lambda: announced.inner_text() == "")
+        opened.page.evaluate(
+            """([stopped, gone]) => {
+              const view = pebble.store.get(stopped, "web/estop").value;
+              pebble.store.set(stopped, "web/estop", { ...view, latched: true, by: "eve" });
+              pebble.store.set(gone, "web/liveness", { online: false });
+            }""",
+            [FRED, GOOB],
+        )
+        assert opened.until(lambda: "fred was stopped by eve. goob is" in opened.test("announcement").inner_text())
 
 
 def test_a_button_that_is_switched_off_while_it_is_held_does_nothing(show: Show, server: CannedServer) -> None:
@@ -183,34 +182,102 @@ def test_a_button_that_is_switched_off_while_it_is_held_does_nothing(show: Show,
         assert server.sent("estop-reset") == []
 
 
+# -- the fleet
+
+
+def names(cards: Locator) -> list[str]:
+    return cards.locator("h2").all_inner_texts()
+
+
+def test_the_first_steps_are_ticked_and_can_be_hidden(show: Show) -> None:
+    with show(STATES["fleet"]) as opened:
+        steps = opened.test("first-time")
+        steps.wait_for()
+        assert steps.locator(".step.done").count() == 0
+        opened.page.evaluate("pebble.settings.begin('drive')")
+        assert opened.until(lambda: steps.locator(".step.done").count() == 1)
+        opened.test("hide-first-time").click()
+        opened.page.reload()
+        opened.test("card-goob").wait_for()
+        assert steps.count() == 0
+
+
+def test_of_a_thousand_those_on_the_screen_are_drawn_and_each_is_found(show: Show) -> None:
+    with show(STATES["fleet-thousand"]) as opened:
+        cards = opened.page.locator(".fleet-card")
+        assert opened.until(lambda: 10 < cards.count() < 120)
+        opened.page.evaluate("scrollTo(0, document.body.scrollHeight / 2)")
+        assert opened.until(lambda: "robot-05" in names(cards)[40])
+        assert cards.count() < 120
+        online = opened.page.locator("[aria-label=Online] .fleet-card")
+        opened.page.evaluate(
+            "pebble.store.set('pebble/robots/robot-0030', 'charging-level', { value: 42, unit: '%' }), scrollTo(0, 0)"
+        )
+        opened.test("sort").select_option("battery")
+        assert opened.until(lambda: names(online)[:2] == ["robot-0030", "robot-0001"])
+        opened.test("filter").fill("0053 BOB")
+        assert opened.until(lambda: names(cards) == ["robot-0053"])
+        opened.test("card-robot-0053").get_by_role("link").click()
+        assert opened.until("location.pathname !== '/'", 3)
+        opened.page.go_back()
+        assert opened.until(lambda: names(cards) == ["robot-0053"])  # what was looked for is kept
+        opened.test("filter").fill("stopped")
+        assert opened.until(lambda: len(names(cards)) == 10)
+
+
+def test_a_stop_of_all_shows_how_many_have_confirmed_it(show: Show) -> None:
+    with show(STATES["fleet-thousand"]) as opened:
+        opened.page.locator(".fleet-card").first.wait_for()
+        opened.test("stop-all").click()
+        confirm = """(number) => pebble.store.refs().forEach((ref, at) => pebble.store.set(ref, "web/estop", {
+          ...pebble.store.get(ref, "web/estop").value, latched: true, stop: pebble.estop.pressed.stop,
+          sending: at < number ? "confirmed" : "sent" }))"""
+        for number, words in ((997, "997 of 1000 confirmed."), (1000, "all 1000 confirmed.")):
+            opened.page.evaluate(confirm, number)
+            assert opened.until(lambda: opened.test("tally").inner_text() == f"STOP ALL: {words}")  # noqa: B023
+        assert opened.page.locator(".stops .banner").count() <= 51  # one resets all
+
+
+# -- the code that phones scan
+
+
+def test_the_code_has_the_address_of_this_screen_and_none_that_no_phone_can_open(
+    show: Show, server: CannedServer
+) -> None:
+    with show(STATES["fleet"]) as opened:
+        opened.test("fleet-more").click()
+        opened.test("phone").click()
+        opened.test("only-here").wait_for()
+        assert opened.page.locator(".qr").count() == 0
+    module = server.static.files["core/browser-more.js"].decode()
+    anywhere = answer(module.replace("isLoopback =", "isLoopback = () => false, _isLoopback ="))
+    with show(STATES["driving"], theme="dark", routes={"**/core/browser-more.js": anywhere}) as opened:
+        do(opened, "settings")
+        do(opened, "open-phone")
+        picture = cv2.imdecode(np.frombuffer(opened.page.locator(".qr").screenshot(), np.uint8), cv2.IMREAD_COLOR)
+        assert picture is not None
+        assert cv2.QRCodeDetector().detectAndDecode(picture)[0] == server.url + GOOB_PATH
+        assert opened.complaints() == []
+
+
 # -- robots that write anything
 
 MARKUP, LONG = "<img src=x onerror=alert(1)>", "long " * 400
 FIELDS = [{"name": "f", "type": "u8"}] * 2
-NASTY: list[Any] = [None, 7, LONG, [], {"value": {MARKUP: 1}}, {"value": []}, {"shapes": [[[1e300, None]] * 300] * 50}]
-NASTY += [{"value": {"a": {"b": {"c": {"d": {"e": [1]}}}}}}, {"value": {str(number): number for number in range(500)}}]
+NASTY: list[Any] = [None, LONG, {"value": {MARKUP: 1}}, {"value": []}, {"shapes": [[[1e300, None]] * 300] * 50}]
+NASTY += [{"value": {str(number): number for number in range(500)}}]
+FORM_OF_MARKUP = {"file": MARKUP, "label": LONG, "configs": [setting(MARKUP, MARKUP, "string", MARKUP)]}
 #: What of it the server lets pass: of each metric, payloads of any shape, and forms, manifests and texts.
 HOSTILE = {
-    "soundboard-files": {"files": [MARKUP, LONG]},
     "soundboard-status": {"playing": True, "file": LONG, "error": MARKUP},
-    "autonomy-files": {
-        "files": [{"file": MARKUP, "label": LONG, "configs": [setting(MARKUP, MARKUP, "string", MARKUP)]}]
-    },
+    "autonomy-files": {"files": [FORM_OF_MARKUP]},
     "autonomy-status": {"running": True, "file": LONG, "error": MARKUP, "config": {MARKUP: LONG}},
     "mcu/lamp-1/describe": {
         "model": MARKUP,
         "interfaces": [{"name": MARKUP, "dir": "out", "encoding": {"fields": FIELDS}}] * 2,
     },
 }
-ANY = (
-    "sensors/imu",
-    "wheel-odometry",
-    "video-overlays",
-    "status",
-    "charging-level",
-    "outlets/o1/status",
-    "mcu/lamp-1/lamp",
-)
+ANY = ("sensors/imu", "wheel-odometry", "video-overlays", "status", "charging-level", "outlets/o1/status")
 
 
 def test_what_a_robot_writes_is_only_text_and_breaks_no_card(show: Show, server: CannedServer) -> None:

@@ -1,44 +1,21 @@
-"""Plots, the map of the odometry, what is drawn over pictures, snapshots, and a robot's own stream; in Chromium."""
+"""Plots, what is drawn over pictures, snapshots, and a robot's own stream; in Chromium."""
 
 from __future__ import annotations
 
 import io
 import time
-from collections.abc import Iterator
-from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
-from playwright.sync_api import Browser
 
-from tests.ext.page.browser import Tab
-from tests.ext.page.canned import CannedServer, Show, showing
-from tests.ext.page.states import (
-    SENSORS,
-    STATES,
-)
+from tests.ext.page.browser import Size
+from tests.ext.page.canned import CannedServer, Show
+from tests.ext.page.states import SENSORS, STATES
 
 pytestmark = pytest.mark.page
-
-
-@pytest.fixture(scope="module")
-def show(server: CannedServer, browser: Browser) -> Show:
-    return partial(showing, server, browser, when="!!window.pebble?.connection.you")
-
-
-@pytest.fixture(scope="module")
-def _sensors(show: Show) -> Iterator[Tab]:
-    with show(SENSORS) as opened:
-        yield opened
-
-
-@pytest.fixture
-def sensors(_sensors: Tab) -> Iterator[Tab]:
-    """One page for several tests."""
-    yield _sensors
-    assert _sensors.complaints() == []
+HERE = "!!window.pebble?.connection.you"
 
 
 def seen(place: Any) -> Any:
@@ -51,31 +28,16 @@ def like(pixels: Any, colour: tuple[int, ...]) -> Any:
     return np.abs(pixels - np.array(colour)).sum(axis=2) < 60
 
 
-def inked(opened: Tab, canvas: str, ink: str) -> Any:
-    """Return which pixels of a canvas have a colour of its style."""
-    place = opened.page.locator(canvas)
-    colour = place.evaluate("(canvas, ink) => getComputedStyle(canvas).getPropertyValue(ink).trim()", ink)
-    return like(seen(place), tuple(int(colour[at : at + 2], 16) for at in (1, 3, 5)))
-
-
-# -- plots and map
-
-
-def test_a_plot_is_drawn_up_to_now_and_its_newest_value_is_text(sensors: Tab) -> None:
-    for name in ("battery", "attitude", "touch"):
-        canvas = f"[data-test=plot-{name}] canvas"
-        late = lambda canvas=canvas: np.array_split(inked(sensors, canvas, "--line-0"), 5, axis=1)[-1]
-        assert sensors.until(lambda: late().sum() > 5)  # noqa: B023
-    texts = sensors.test("plot-battery").locator("li").all_inner_texts()
-    assert [" ".join(text.split()) for text in texts] == ["battery 7.92 V"]
-
-
-@pytest.mark.parametrize("language", ["C", "en-US@posix"])
-def test_plots_are_drawn_where_the_language_has_a_name_that_browsers_do_not_know(show: Show, language: str) -> None:
-    named = f"Object.defineProperty(Navigator.prototype, 'language', {{ get: () => {language!r} }})"
+def test_a_plot_is_drawn_up_to_now_whatever_the_language_is_called(show: Show) -> None:
+    """No browser knows the name of this language."""
+    named = "Object.defineProperty(Navigator.prototype, 'language', { get: () => 'en-US@posix' })"
     with show(SENSORS, script=named) as opened:
-        opened.test("plot-battery").scroll_into_view_if_needed()
-        assert opened.until("document.querySelector('[data-test=plot-battery] canvas') !== null")
+        canvas = opened.test("plot-battery").locator("canvas")
+        colour = canvas.evaluate("(canvas) => getComputedStyle(canvas).getPropertyValue('--line-0').trim()")
+        ink = tuple(int(colour[at : at + 2], 16) for at in (1, 3, 5))
+        assert opened.until(lambda: np.array_split(like(seen(canvas), ink), 5, axis=1)[-1].sum() > 5)
+        text = opened.test("plot-battery").locator("li").inner_text()
+        assert " ".join(text.split()) == "battery 7.92 V"
         assert opened.complaints() == []
 
 
@@ -107,8 +69,9 @@ def area(pixels: Any, colour: tuple[int, int, int]) -> tuple[int, int, int, int]
 PICTURE, INK = (255, 0, 255), (77, 243, 255)
 
 
-def assert_a_square_in_the_middle(opened: Tab, pixel: float = 1.0) -> None:
-    """Its corners are a quarter and three quarters of what is seen of the picture; ``pixel``: of the line."""
+@pytest.mark.parametrize(("size", "scale"), [("desktop", 2), ("phone", 1)])
+def test_what_is_drawn_over_a_picture_is_where_it_belongs(show: Show, size: Size, scale: int) -> None:
+    """The corners of a square are a quarter and three quarters of what is seen of the picture."""
     areas: list[Any] = []
 
     def are_both_seen() -> bool:
@@ -116,42 +79,22 @@ def assert_a_square_in_the_middle(opened: Tab, pixel: float = 1.0) -> None:
         areas[:] = area(pixels, PICTURE), area(pixels, INK)
         return None not in areas
 
-    assert opened.until(are_both_seen, 40)  # a busy machine takes seconds for each picture
-    (left, top, right, bottom), square = areas
-    assert (right - left) / (bottom - top) == pytest.approx(640 / 360, rel=0.01)
-    width, height = right - left, bottom - top
-    expected = (left + width / 4, top + height / 4, right - width / 4, bottom - height / 4)
-    assert square == pytest.approx(expected, abs=1.6 * pixel)
-
-
-OVERLAYS = STATES["overlays"]
-
-
-@pytest.mark.parametrize(
-    ("size", "options"),
-    [
-        ("desktop", {"viewport": {"width": 1100, "height": 560}}),  # bars on both sides of the picture
-        ("desktop", {"viewport": {"width": 1281, "height": 701}, "device_scale_factor": 2}),
-        ("phone", {}),
-    ],
-)
-def test_what_is_drawn_over_a_picture_is_where_it_belongs(show: Show, size: Any, options: dict[str, Any]) -> None:
-    with show(OVERLAYS, size, **options) as opened:
+    with show(STATES["overlays"], size, when=HERE, device_scale_factor=scale) as opened:
         opened.page.evaluate(_PLAIN)
-        assert_a_square_in_the_middle(opened, options.get("device_scale_factor", 1))
+        assert opened.until(are_both_seen, 40)  # a busy machine takes seconds for each picture
+        (left, top, right, bottom), square = areas
+        width, height = right - left, bottom - top
+        assert width / height == pytest.approx(640 / 360, rel=0.01)
+        expected = (left + width / 4, top + height / 4, right - width / 4, bottom - height / 4)
+        assert square == pytest.approx(expected, abs=1.6 * scale)  # pixels of the line
         assert opened.complaints() == []
 
 
-def test_overlays_in_full_screen_where_stop_and_the_reason_remain_and_overlays_that_are_off(
-    show: Show, server: CannedServer
-) -> None:
-    with show(OVERLAYS) as opened:
-        opened.page.evaluate(_PLAIN)
+def test_stop_and_the_reason_remain_in_full_screen_and_overlays_can_be_off(show: Show, server: CannedServer) -> None:
+    with show(STATES["overlays"]) as opened:
         opened.test("full-screen").click()
         assert opened.until("!!document.fullscreenElement && !!document.querySelector('.immersive')")
-        assert opened.test("stop-one").is_visible()
         assert opened.test("why").is_visible()
-        assert_a_square_in_the_middle(opened)
         opened.test("stop-one").click()
         assert opened.until(lambda: server.sent("estop"))
         opened.page.get_by_label("Leave full screen").click()
@@ -173,23 +116,9 @@ def test_a_snapshot_is_what_is_on_the_canvas_under_its_time(show: Show) -> None:
         assert opened.complaints() == []
 
 
-def test_a_snapshot_that_would_be_noise_is_not_saved(show: Show) -> None:
-    """As Firefox reads canvases where it resists fingerprinting."""
-    noise = """CanvasRenderingContext2D.prototype.getImageData = (x, y, width, height) =>
-      new ImageData(crypto.getRandomValues(new Uint8ClampedArray(4 * width * height)), width, height)"""
-    with show(STATES["driving"], script=noise) as opened:
-        opened.test("snapshot").click()
-        assert opened.until("document.body.innerText.includes('Not saved: this browser gives pages other pictures')")
-
-
-# -- the robot's own stream
-
-OWN = STATES["own-stream"]
-
-
 def test_a_robots_own_stream_is_shown_in_a_frame_and_never_called_live(show: Show, server: CannedServer) -> None:
     reason = "pebble.driver.reason()?.code ?? ''"
-    with show(OWN) as opened:
+    with show(STATES["own-stream"], when=HERE) as opened:
         assert opened.until(f"{reason} === ''")
         opened.test("gear").click()
         opened.test("open-stream").click()
