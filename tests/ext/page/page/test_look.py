@@ -366,6 +366,61 @@ def test_nothing_that_stops_moves(show: Show, path: str, size: Size, widths: tup
                 } == {}, what
 
 
+#: Parts of what stops a robot, or gives control over it, over which something lies while each of the panels is open.
+COVERED_BY_PANELS = """async () => {
+  const press = (selector) => () => document.querySelector(selector)?.click();
+  const panels = Object.fromEntries([
+    ...["settings", "help", "phone"].map((name) => [name, () => pebble.panels.show(name)]),
+    ...["bell", "gear", "drawer"].map((name) => [name, press(`[data-test=${name}]`)]),
+  ]);
+  const close = () => {
+    pebble.panels.show("");
+    for (const one of document.querySelectorAll(".panel [data-test^=close], [data-test=drawer][aria-expanded=true]," +
+      "[data-test=gear][aria-expanded=true]")) one.click();
+  };
+  const along = (from, length, count) =>
+    Array.from({ length: count }, (_, n) => from + 5 + ((length - 10) * n) / (count - 1)); // within round corners
+  const isCovered = (part) => {
+    const { x, y, width, height } = part.getBoundingClientRect();
+    return along(x, width, 9).some((px) => along(y, height, 5).some((py) => {
+      const hit = document.elementFromPoint(px, py);
+      return hit && !part.contains(hit) && !hit.contains(part) && !hit.closest(".stop-area"); // around STOP
+    }));
+  };
+  const found = [];
+  for (const [name, open] of Object.entries(panels)) {
+    open();
+    await new Promise((resolve) => setTimeout(resolve, 60));
+    const parts = [...document.querySelectorAll(".top .stop, .banner, [data-test^=reset], [data-test^=take]," +
+      "[data-test=ask], [data-test=stop-script]")].filter((one) => one.checkVisibility({ visibilityProperty: true }));
+    found.push(...parts.filter(isCovered).map((one) => `${name}: ${one.outerHTML.slice(0, 120)}`));
+    close();
+  }
+  return found;
+}"""
+
+
+@pytest.mark.parametrize("path", [STILL.path, f"/r/{LAMP}", "/"])
+@pytest.mark.parametrize(
+    ("size", "width", "height"),
+    [
+        ("desktop", 1440, 900), ("desktop", 1024, 768), ("desktop", 800, 900),
+        ("phone", 390, 844), ("phone", 320, 640), ("landscape", 844, 390),
+    ],
+)  # fmt: skip
+def test_no_panel_covers_a_part_of_what_stops_or_takes(
+    show: Show, size: Size, width: int, height: int, path: str
+) -> None:
+    with show(replace(STILL, path=path), size, viewport={"width": width, "height": height}) as opened:
+        assert opened.until("!!window.pebble?.connection.you && !document.querySelector('main .loading')", 60)
+        opened.page.evaluate(COVERED_BY_PANELS)  # what they are made of is here now
+        ref, problems = {"/": GOOB}.get(path, path.removeprefix("/r/")), {}
+        for what in HAPPENS:
+            _happens(opened.page, ref, what)
+            problems[what] = opened.page.evaluate(COVERED_BY_PANELS)
+        assert [(what, one) for what, found in problems.items() for one in found] == []
+
+
 def test_a_small_phone_shows_all_that_drives_at_once(show: Show) -> None:
     with show(STATES["driving"], "phone", viewport={"width": 360, "height": 640}) as opened:
         _ready(opened)
