@@ -57,7 +57,7 @@ def test_links_anchors_and_files_that_it_names_exist(document: Path) -> None:
 
 
 ALL_TEXT = "\n".join(path.read_text() for path in DOCUMENTS)
-EXAMPLES = {"MyTransport"}  # a class of the reader
+EXAMPLES = {"MyTransport", "twist_mux"}  # a class of the reader; a program of ROS 1
 
 
 def test_classes_functions_and_variables_that_they_name_exist() -> None:

@@ -286,7 +286,7 @@ def test_what_is_retained_is_one_key(hall: Hall) -> None:
         assert until(lambda: not hall.retained())
 
 
-@pytest.mark.parametrize(("name", "what"), [("vera", "hellos"), ("fred", "states")])
+@pytest.mark.parametrize(("name", "what"), [("vera", "hellos"), ("vera", "queries"), ("fred", "states")])
 def test_what_an_account_asks_or_retains_holds_up_no_one_who_comes(hall: Hall, name: str, what: str) -> None:
     """A hub had ten thousand hellos of a viewer wait, 2 GB of them, and a client that came heard nothing meanwhile."""
     hall.eye.publish(STATE, b"before", qos=QoS.DELIVERED, retain=True)

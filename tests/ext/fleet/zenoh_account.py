@@ -29,21 +29,29 @@ class Plan(msgspec.Struct):
     filters: list[str] = []
     retain: bool = False
     will: str = ""
-    flood: Literal["", "hellos", "states"] = ""
+    flood: Literal["", "messages", "hellos", "queries", "states"] = ""
 
 
 def flood(session: zenoh.Session, plan: Plan) -> None:
-    """Send with the first priority, waiting for room, as no client of ours does; print a line once it flows."""
+    """What has the first priority and waits for room, as no client of ours sends it; a line once it flows."""
     first: dict[str, Any] = {"priority": zenoh.Priority.REAL_TIME, "congestion_control": zenoh.CongestionControl.BLOCK}
+    publishers = [session.declare_publisher(one, **first) for one in plan.topics]
     own = dict.fromkeys(map(str, range(12_000)), 1)
     hello = wire.encode(wire.Hello(f"{plan.name}{wire.OF}1", 0, None, own))
+    asked: dict[str, tuple[str, bytes]] = {
+        "hellos": (wire.asked(wire.HELLO, plan.name), hello),
+        "queries": (f"{wire.RETAINED}*/*/*/outgoing/**", wire.encode({"comes-never": 1})),
+    }
     states = f"{wire.RETAINED}pebble/robots/fred/outgoing"
     stamp = wire.Stamp(QoS.DELIVERED, 0, f"{plan.name}{wire.OF}1").pack()
     ignore = zenoh.handlers.Callback(lambda _reply: None, indirect=False)
     for number in itertools.count():
-        if plan.flood == "hellos":
-            session.get(wire.asked(wire.HELLO, plan.name), ignore, payload=hello, timeout=0.5, **first)
-        else:
+        for one in publishers:
+            one.put(b"[" * 60)
+        if plan.flood in asked:
+            key, payload = asked[plan.flood]
+            session.get(key, ignore, payload=payload, timeout=0.5, **first)
+        if plan.flood == "states":
             session.put(
                 f"{states}/{number % 5000}", bytes(60 + number % 100 // 99 * 200_000), attachment=stamp, **first
             )

@@ -117,7 +117,7 @@ def test_whatever_is_sent_the_script_reads_exactly_the_effective_settings(wanted
 
 
 def test_a_command_cannot_name_a_file_on_the_robot() -> None:
-    for key in ("output_path", "save-dir", "LOG_FILE"):
+    for key in ("log_file", "output_path", "save-dir", "LOG_FILE"):
         setting = Setting(key=key, default="/var/log/x", arg="--x")
         assert form((setting,)) == []
         assert effective((setting,), {key: "/etc/passwd"}) == {key: "/var/log/x"}
