@@ -154,7 +154,7 @@ class World:
             self._planted: set[str] = set()
             self._looked: EstopState | None = None
             self._older: dict[Path, bytes] = {}
-            assert until(self.rig.lists_scripts, 20), self.rig.log.read_text()
+            assert until(self.rig.lists_scripts, 60), self.rig.log.read_text()
             self._opened = opened.pop_all()
 
     def close(self) -> None:
