@@ -183,7 +183,7 @@ class ForwardingService(Service, ABC):
                 self.call_at(self.clock() + QUIET_S, synchronize)  # more may come
             elif side is Side.LOCAL or epoch == self.epoch:  # the remote side has not been lost meanwhile
                 self.forwarder.retained.synchronize(side)
-                if side is Side.REMOTE or self.rules.leaves_robot:
+                if side is Side.REMOTE or self.rules.leaves_robot:  # in the mirror only for its broker
                     self.forwarder.publisher.probe_commands(*self.probed_sides)
 
         self.call_at(self.clock() + INITIAL_SYNC_S, synchronize)
