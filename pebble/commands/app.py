@@ -111,7 +111,7 @@ class _Listed(TyperCommand):
             for words in self._offered
             if words.startswith(f"{self._words} ")
         }
-        if arguments and arguments[0] in listed:
+        if arguments and arguments[0] in listed:  # the module of this command is not needed
             return TyperGroup(name=self.name, commands=listed, rich_markup_mode=None)
         loaded, name = part(self._offered[self._words].place), str(self.name)
         app = typer.Typer(rich_markup_mode=None)

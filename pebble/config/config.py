@@ -159,10 +159,10 @@ def _config(
     file_class, config_class, rules = _classes(installed)
     reader = Reader(folder, env, rules, notes, file=path, other_forms=True)
     merged = with_instances(written)
-    unread = extensions.keys_of_missing(installed)  # no class has them: they would be unknown keys
+    unused = extensions.keys_of_missing(installed)  # keys that no class has: they would be unknown keys
     if core_only:
-        unread += [key for extension in available for key in extension.sections]
-    root = reader.section(file_class, without(merged, unread))
+        unused += [key for extension in available for key in extension.sections]
+    root = reader.section(file_class, without(merged, unused))
     notes.forget_inherited(written, merged)
     if path is not None and holds_secret(written):
         warn_if_readable(notes, (), path, "it, and there is a password in it")
@@ -187,10 +187,15 @@ def _config(
     if not is_text(str(config.run_dir())):
         why = "is no UTF-8, and sockets below it have to be: set it to another folder"
         raise ConfigError(f"transport.run_dir: {shown(str(config.run_dir()))}: {why}")
+    return replace(config, motor_owners=_motor_owners(config))
+
+
+def _motor_owners(config: Config) -> tuple[str, ...]:
+    """Return the names of all motor owners: serial lines and extensions. Raises ConfigError if two have one name."""
     owners = (*map(config.motor_owner, config.motor_lines()), *extensions.motors_of(config.installed, config))
     if len(owners) > len(set(owners)):
         raise ConfigError("extensions: two motor owners have one name; serial lines are called as their instances")
-    return replace(config, motor_owners=owners)
+    return owners
 
 
 def _extensions(written: Any, folder: Path) -> tuple[tuple[Extension, ...], tuple[Missing, ...]]:
@@ -277,7 +282,7 @@ def default_run_folder(base: str, env: Mapping[str, str]) -> Path:
     if by_systemd := env.get("RUNTIME_DIRECTORY"):
         return Path(by_systemd.split(":")[0])  # one per RuntimeDirectory= of the unit
     if _is_run_from(RUN_DIR_OF_UNIT, base):
-        return RUN_DIR_OF_UNIT
+        return RUN_DIR_OF_UNIT  # a tool in a shell finds the robot that our unit runs
     robot = f"{zlib.crc32(base.encode()):08x}"
     if (by_login := env.get("XDG_RUNTIME_DIR")) and is_text(by_login):
         return Path(by_login, "pebble", robot)

@@ -47,7 +47,7 @@ def reading_of(annotation: Any, kind: Any, metas: list[Meta], raw: Any, default:
     if kind not in (int, float) or number is None or "exact" in extra:
         return None
     for meta in metas:
-        if meta.gt is not None and number <= meta.gt:
+        if meta.gt is not None and number <= meta.gt:  # no number is the nearest above a limit
             return None if default is NODEFAULT else Reading(default)
         if meta.ge is not None:
             number = max(meta.ge, number)

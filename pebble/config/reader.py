@@ -59,11 +59,11 @@ class Reader:
         keys = _known(kind)
         if not isinstance(raw, dict):
             if self._other_forms and "enabled" in keys and switch(raw) is not None:
-                raw = {"enabled": raw}
+                raw = {"enabled": raw}  # a mere true or false in place of the section
             else:
                 raw = self._otherwise(kind, raw, path, {} if path else NODEFAULT)  # the whole file has no default
         values: dict[str, Any] = {}
-        pairs = () if raw is _WRONG else raw.items()
+        pairs = () if raw is _WRONG else raw.items()  # a refused section has all its defaults
         for written, value in pairs:
             key = self._key(kind, keys, written, (*path, written))
             field = keys.get(key)
@@ -85,7 +85,7 @@ class Reader:
         return section
 
     def _key(self, kind: type[Section], known: Mapping[str, Any], key: str, path: problems.Path) -> str:
-        """Return the present name of a key that may be written under another one. Note an unknown key."""
+        """Return the present name of a key. Note an unknown one, as a warning only if it may be another program's."""
         name = kind.other_names.get(key, key)
         for retired, replacement in kind.all_retired().items():
             if key == retired or (retired.endswith("*") and key.startswith(retired[:-1])):
@@ -155,7 +155,7 @@ class Reader:
             self.notes.warning(path, f"{must_be}; {used}")
             return reading.value
         is_raw = reading is not None and type(reading.value) is type(raw) and reading.value == raw
-        if reading is None or is_raw:  # raw itself was refused before this call
+        if reading is None or is_raw:  # raw was refused before this call, and would be again
             self.notes.problem(path, must_be)
             return _WRONG
         return self._plain(annotation, reading.value, path, NODEFAULT)

@@ -43,6 +43,7 @@ def _without_login(match: re.Match[str]) -> str:
         return word
     end = ats[-1]
     slashes = _SLASHES.search(word)
+    # The first colon with a password after it; the user name before it begins after a sign such as a quote.
     colon = next((colon for colon in _COLON.finditer(word, 0, end) if colon.end() < end), None)
     if slashes and slashes.end() <= end:
         start = slashes.end()

@@ -30,7 +30,7 @@ class Security(Section, frozen=True, kw_only=True):
 
     @property
     def unnamed(self) -> Strangers:
-        """Rule for drive commands without a key of control."""
+        """Rule for drive commands without a key of control: ``strangers``, or else the default of the level."""
         return self.strangers or ("refuse" if self.level == "named" else "free")
 
     def on_board(self) -> dict[str, str]:

@@ -175,7 +175,7 @@ def _switch(command: Any) -> Any:
 
 
 def _request(channel: Channel, request: Any) -> Any:
-    """Return the fields of a media request, which may have any form of a boolean control; ``enabled`` is its state."""
+    """Return the fields of a media request, always with ``enabled``: a bare ``true`` is ``{"enabled": true}``."""
     inner = request["value"] if isinstance(request, dict) and isinstance(request.get("value"), dict) else request
     given = inner if isinstance(inner, dict) else {}
     return {**given, "enabled": _boolean(channel, inner)}
@@ -200,7 +200,8 @@ def _drive(channel: Channel, command: dict[str, Any], remark: Remark) -> dict[st
     valid = {key: value for key, value in given.items() if key not in wrong}
     if "valid_ms" in valid:
         valid["valid_ms"] = int(valid["valid_ms"])
-    return axes | valid | {key: command[key] for key, fits in _DRIVE_MORE.items() if fits(command.get(key))}
+    others = {key: command[key] for key, fits in _OTHER_DRIVE_FIELDS.items() if fits(command.get(key))}
+    return axes | valid | others
 
 
 class _Rule(NamedTuple):
@@ -220,7 +221,7 @@ _DRIVE_RULES: dict[str, _Rule] = {
     ),
 }
 #: Its other fields, each with its rule; a wrong value is the same as absent, because none of them decides about motion.
-_DRIVE_MORE: dict[str, Callable[[Any], bool]] = {
+_OTHER_DRIVE_FIELDS: dict[str, Callable[[Any], bool]] = {
     "t": lambda value: type(value) is int and 0 <= value <= p.LARGEST_MS,
     "by": lambda value: isinstance(value, str),
     "group": lambda value: isinstance(value, bool),

@@ -52,7 +52,7 @@ def _member(metric: str, command: Any, by: Any) -> Member:
         raise PayloadError(f"{c.GROUP.metric}: {metric[:_SHOWN]!a} may not be in a group")
     if not isinstance(command, dict) or isinstance(command.get("value"), dict):
         raise PayloadError(f"{c.GROUP.metric}: {metric}: a bare object is needed")
-    command.pop(MARK, None)  # only a copy of a member may have it
+    command.pop(MARK, None)  # no sender may set it: only the bridge marks, and only copies
     if by is not None:
         command[BY] = by
     try:

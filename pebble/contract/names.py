@@ -40,7 +40,7 @@ def without_name(topic: str) -> Named | None:
 
 
 def stop_topic(topic: str) -> str | None:
-    """Return the topic of stops without the accounts in it, even invalid ones; None for other topics."""
+    """Return a topic of stops without its accounts, valid or not; None for another topic, or if it has no account."""
     match = _STOP.fullmatch(topic)
     return None if match is None else match[1] + match[2]
 

@@ -17,8 +17,8 @@ MAX_UNKNOWN_FLAGS = 64  # each is retained on the robot: in its broker or hub, a
 class Admission:
     """Limits on size, and on the number of actions and of messages that the contract does not know.
 
-    Of unknown flags a limited number is admitted from outside. Those that the robot's side has are always admitted, and
-    counted as well: a restarted bridge so counts again the flags that it had passed on before.
+    Of unknown flags from outside a limited number is admitted. Flags from the robot's side are always admitted, and
+    count as well: so a restarted bridge counts those again that it had passed on before.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -33,22 +33,23 @@ class Admission:
     def refuse(self, side: Side, subject: Subject, message: Message, topic: str, *, named: bool = True) -> Drop | None:
         """Return why this message may not pass to ``topic``; None if it may. Hot.
 
-        Counts the message if its kind is limited, and remembers an unknown flag. ``named`` False: the message has no
-        sender where others have one. Such messages have a limit of their own.
+        Counts the message if its kind is limited, and remembers an unknown flag. ``named`` is False if names are
+        checked, and the message has none: such messages have a limit of their own.
         """
         is_large = side is Side.REMOTE and len(message.payload) > MAX_COMMAND_BYTES
         if is_large and subject.kind.direction == INCOMING and not subject.is_stop:  # any payload is a stop
             return Drop.TOO_LARGE
-        return self._count(side, subject, message, topic, named) if subject.counted else None
+        return self._refuse_limited(side, subject, message, topic, named) if subject.counted else None
 
-    def _count(self, side: Side, subject: Subject, message: Message, topic: str, named: bool) -> Drop | None:
+    def _refuse_limited(self, side: Side, subject: Subject, message: Message, topic: str, named: bool) -> Drop | None:
+        """Return why one more message of a limited kind may not pass; None if it may. Counts it."""
         if side is Side.REMOTE and self._is_too_often(subject, message, named):
             return Drop.TOO_OFTEN
         if subject.kind is not Kind.FLAG or subject.channel is not None:
             return None
         if not message.payload:  # a removal, which needs no room
-            if side is Side.REMOTE and topic not in self._flags:  # the robot has no such flag
-                return Drop.KNOWN
+            if side is Side.REMOTE and topic not in self._flags:
+                return Drop.KNOWN  # the robot has no such flag: it is removed already
             self._flags.discard(topic)
         elif side is Side.LOCAL or topic in self._flags or len(self._flags) < MAX_UNKNOWN_FLAGS:
             self._flags.add(topic)

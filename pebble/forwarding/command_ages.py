@@ -52,7 +52,7 @@ class CommandAges:
         if not isinstance(command.t, int) or not key:
             return waited_s
         sender, sent_s, now = (account, key), command.t / 1000, clock.since_boot()
-        if command.ends():  # it may come another way, so it says nothing about the way of the others
+        if command.ends():  # it may come another way, with another delay: only its stamp is noted
             clocks.pass_over(sender, sent_s, now)
             return waited_s
         if clocks.is_passed(sender, sent_s):

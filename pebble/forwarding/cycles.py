@@ -100,14 +100,16 @@ class Cycles:
                 return self._receive_probe(side, topic, number)
             way, now = self._ways.get((side, topic)) or self._way(side, topic), self._clock()
             count = way.count(payload, now)
-            if way.closed and ((is_one_shot and not subject.runs) or count > SUSPICIOUS):
-                return Finding.CIRCULATES  # of the others the first few pass: the caller recognises those
+            if way.closed:
+                is_recognised = subject.runs or not is_one_shot  # when it comes back, by the caller: so a few pass
+                if not is_recognised or count > SUSPICIOUS:
+                    return Finding.CIRCULATES
             period = _PERIOD_IN_STORM_S if count > STORM and not way.closed else PROBE_PERIOD_S
             never_probed = way.probed_at == float("-inf")
             # Where any topic circulates, all others may as well.
             is_suspicious = way.closed or count > usual or (never_probed and bool(self.closed_ways))
             can_be_probed = is_one_shot or len(payload) <= _LONGEST
-            # The other way may be younger than the last probe: so the first suspicious message is probed at once.
+            # Another bridge may have begun since the last probe: so the first suspicious message is probed at once.
             is_due = now - way.probed_at >= period or count == usual + 1
             return Finding.SUSPECT if is_suspicious and can_be_probed and is_due else Finding.PASS
 

@@ -185,7 +185,7 @@ class Forwarder:
         if kind is None or (kind is Kind.FLAG and not self._admission.refuses_flag(topic)):
             return False  # not invented, or an unknown flag for which there is room
         drop = Drop.TOO_MANY if kind is Kind.FLAG else Drop.STALE
-        self.sides[side].window.note()
+        self.sides[side].window.note()  # more may follow, an old stop among them
         self.counters.add(f"{side.value}: {drop.value}")
         self._warn(drop, topic[:_LOGGED].decode(errors="replace"))
         return True
@@ -215,8 +215,8 @@ class Forwarder:
             outcome = sender.foreign  # the reason
         elif isinstance(outcome, Forward):
             match names.sign(sender, message):
-                case Signed(signed, by) if by != NO_ACCOUNT and subject.kind is Kind.FLAG:  # for both sides
-                    outcome = self.retained.change(subject, signed)
+                case Signed(signed, by) if by != NO_ACCOUNT and subject.kind is Kind.FLAG:
+                    outcome = self.retained.change(subject, signed)  # both sides have flags on topics without names
                 case Signed(signed, by):
                     outcome = self.pass_on(source, subject, signed, outcome, sender.account)
                 case Drop.UNNAMED if outcome.retain:  # it may be a retained message of the robot itself
@@ -232,13 +232,13 @@ class Forwarder:
     ) -> Forward | Drop:
         """Return how to forward ``message``, or why it does not pass. Hot.
 
-        ``topic`` is the topic on the other side.
+        ``topic`` is the topic on the other side. ``named`` is True if the sender has an account, or names do not count.
         """
-        if subject is None or not subject.is_stop:
-            if message.retain:  # while such messages arrive, a stop among them is an old one
-                source.window.note()
-        elif not source.window.is_old_stop(message):
-            message = Message(message.topic, message.payload, message.qos)  # live: passes, and is retained nowhere
+        if subject is not None and subject.is_stop:
+            if not source.window.is_old_stop(message):
+                message = Message(message.topic, message.payload, message.qos)  # live: passes, and is retained nowhere
+        elif message.retain:
+            source.window.note()  # while such messages arrive, a stop among them is an old one
         if subject is None:
             return Drop.FOREIGN
         forward = self._route(source.side, subject, message)
@@ -325,7 +325,7 @@ class Forwarder:
         tells_age = forward.stamped and STAMP_LETTER in message.payload and STAMP in message.payload
         waited_s = self.ages.waited_s(subject, message, account) if tells_age else message.waited_s
         late = waited_s > subject.waits_s and not ends_something(subject, message)
-        # A late one that tells its age is no sign of a flood: its sender keeps to the pace of the link.
+        # Many late ones are a flood, except those that tell their age: their senders keep to the pace of the link.
         if forward.stamped and not (late and tells_age):
             self.note_age(late)
         return late
@@ -351,7 +351,7 @@ class Forwarder:
             payloads = list(self._pass_stop(source.side, message.payload))
             for payload in payloads:
                 self.publisher.publish(target, subject, Message(message.topic, payload, message.qos), forward)
-            return forward if payloads else Drop.RESET
+            return forward if payloads else Drop.RESET  # or, in the mirror, it is for one motor owner
         if is_event:
             self.publisher.note_return(target, subject, message)
             target.events.send(message)

@@ -50,7 +50,7 @@ class Publisher:
         if not accepted:
             self._counters.add(f"{to.side.value}: refused")
         if echoing and (not accepted or transport.state is not State.CONNECTED):
-            to.loopback.forget(topic)
+            to.loopback.forget(topic)  # it is not on its way, so nothing comes back
 
     def note_return(self, to: SideState, subject: Subject, message: Message) -> None:
         """Expect ``message``, published to one side, to come back on the other side, if its topic circulates.

@@ -120,7 +120,7 @@ class RetainedTopics:
         """Return why a two-way message must not pass; None if it may. ``only_old``: a live one must not."""
         side, topic, payload, transport = source.side, message.topic, message.payload, source.transport
         if message.retain and topic in source.seen and transport.policy.delivers_late and not transport.as_published:
-            return Drop.KNOWN  # it came late, after a live one, and is older
+            return Drop.KNOWN  # certainly retained, and came late: it is older than the live one before it
         if len(source.seen) < _MAX_WAITING:
             source.seen.add(topic)
         retained = self._sides.gate is not Gate.SHUT and self._is_retained(source, message)

@@ -39,11 +39,11 @@ class SideState:
         self.window = RetainedWindow(transport, clock)
         self.loopback = LoopbackFilter(clock)  # of a broker without bridge mode
         self.returns = LoopbackFilter(clock, _RETURN_S)  # messages that circulate, once each
-        self.seen: set[str] = set()  # two-way topics, since we subscribed
+        self.seen: set[str] = set()  # two-way topics that have had a message since we subscribed
         self.restarted = False  # its retained messages come again, and the reconciliation has not been told
         self._clock, self._wins = clock, wins
         self._lost_at = float("-inf")  # when its state was last another than connected; -inf: never
-        # Its retained messages have not arrived, and are older than ours; of the side that does not win: may be older.
+        # Its retained messages are older than ours (if this side wins), or may be (if not); False once all are here.
         self._went_back = False
 
     @property
@@ -62,10 +62,11 @@ class SideState:
             self.subscribing()  # the transport does so at the next connection
             self.restarted = True
             self._lost_at = self._clock()
-            # Its broker may have restored a save. Noted now, because retained messages may come before CONNECTED does.
+            # A broker that ended may restore a save. Noted now: its retained messages may come before CONNECTED does.
+            # A side that wins is doubted only when the transport has found that it did.
             self._went_back = not self._wins and self.transport.was_ended
         elif self._wins:
-            self._went_back = self._was_brief and self.transport.went_back  # it has compared the broker's with ours
+            self._went_back = self._was_brief and self.transport.went_back  # the transport has compared
 
     @property
     def has_gone_back(self) -> bool:

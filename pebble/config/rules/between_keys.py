@@ -19,13 +19,13 @@ from pebble.errors import PebbleError
 from pebble.ownership import read_for
 
 #: Words in commands of the original's configs, and why they do harm, or nothing, here.
-_OF_ORIGINAL = (
+_WORDS_OF_ORIGINAL = (
     (re.compile(r"\bpebble-control\b").search, "starts the original, too, at the same serial port"),
     (re.compile(r"(?:^|[\s/])(?:sudo|doas|pkexec)\b").search, "needs a right that our unit denies"),
     (re.compile(r"\bgit\b.*\b(?:pull|fetch|merge|reset)\b").search, "updates Pebble only if it runs from that folder"),
 )
-#: The commands for our unit.
-_INSTEAD = {
+#: The commands to write for our unit, by section.
+_COMMANDS_OF_UNIT = {
     "reboot_control": "systemctl --no-ask-password reboot",
     "service_restart_control": "systemctl --no-block restart pebble.service",
     "git_pull_control": "systemctl --no-ask-password start pebble-update.service",
@@ -45,7 +45,7 @@ def _root(reader: Reader, root: Root, _path: Path) -> Root:
         reader.notes.problem(("robot", "type"), f'must not be "{root.robot.type}": those are no robots')
     if platform != "linux" and kind != "mqtt":
         reader.notes.doubt(("transport", "kind"), f'must be "mqtt" where robot.platform is "{platform}"')
-    if not reader.notes.problems:
+    if not reader.notes.problems:  # else a default may stand for a refused topic, host or id
         for path, channel in shared_topics(root):
             reader.notes.problem(path, f"is also the topic of {channel.suffix}, choose another")
         warn_of_logins_in_clear(reader.notes, root)
@@ -77,11 +77,11 @@ def _transport(reader: Reader, transport: TransportSection, path: Path) -> Trans
 
 def _bridge(reader: Reader, bridge: MqttBridge, path: Path) -> MqttBridge:
     notes, remote, link = reader.notes, bridge.remote, bridge.link
-    for section, instead in _INSTEAD.items():
+    for section, command_of_unit in _COMMANDS_OF_UNIT.items():
         words = " ".join(getattr(bridge, section).command)
-        reasons = [reason for occurs_in, reason in _OF_ORIGINAL if occurs_in(words)]
+        reasons = [reason for occurs_in, reason in _WORDS_OF_ORIGINAL if occurs_in(words)]
         if bridge.enabled and reasons:
-            notes.warning((*path, section, "command"), f"{', and '.join(reasons)}: write `{instead}`")
+            notes.warning((*path, section, "command"), f"{', and '.join(reasons)}: write `{command_of_unit}`")
     if link.kbit is not None and link.profile == "wide":
         why = 'has no effect at profile "wide": write "thin" or "auto", or leave it out'
         notes.problem((*path, "link", "kbit"), why)
