@@ -89,12 +89,12 @@ class SenderClocks(Generic[K]):
                 clock = self._clock_to_use(key, clock, sent, now, late_s)
             if waited_s <= late_s:
                 clock.proved = max(clock.proved, now - sent - waited_s)
-            # By the least difference that a message without delay may have: an age is rather too great than too small.
+            # Without delay the difference is from `proved` to `least`: by the smaller one an age is rather too great.
             age = now - sent - min(clock.least, clock.proved)
             return age if now - clock.began >= _YOUNG_S else max(age, waited_s)
 
     def is_passed(self, key: K, sent: float) -> bool:
-        """True if a newer message of this sender was received. A much newer stamp means that its clock was set back."""
+        """True if a message newer by up to a second was received. If it is newer by more, the clock was set back."""
         with self._lock:
             clock = self._clocks.get(key)
             return clock is not None and clock.newest - _JUMP_S < sent < clock.newest

@@ -100,8 +100,8 @@ class Subscription:
     def offer(self, message: Message, *, repeat: bool = False) -> None:
         """Queue ``message``, unless it is a retained message of a topic this connection has already delivered (T5, T8).
 
-        As-published connections cannot distinguish retained from live messages; their backend sets ``repeat`` when it
-        is sure that the message is a repetition.
+        A policy with ``delivers_late`` wants it all the same. As-published connections cannot distinguish retained from
+        live messages; their backend sets ``repeat`` when it is sure that the message is a repetition.
         """
         transport = self._transport
         with self._lock:
@@ -357,13 +357,13 @@ class Transport(ABC):
     ) -> bool:
         """Publish one message; return whether it was accepted.
 
-        A live message is refused while there is no connection (on Zenoh: to other processes; CONNECTING only means that
-        the hub is away), and never delivered late. A retained message is accepted unless the transport is closed: the
-        newest value of each topic is stored, for at most 10,000 topics and 16 MB, and sent when the connection is back
-        (T4). ``remember`` False: it is not stored here, because others change it as well; without a connection it is
-        refused. ``shared``: others change it as well, so after an outage a different value there counts as newer than
-        ours, and stays (T9). ``urgent`` gives commands and flags priority where the backend can. Raises TransportError
-        for a topic that is not allowed.
+        A live message is refused while there is no connection, and never delivered late. In CONNECTING a peer of Zenoh
+        is still connected to other processes: only the hub is away. A retained message is accepted unless the transport
+        is closed: the newest value of each topic is stored, for at most 10,000 topics and 16 MB, and sent when the
+        connection is back (T4). ``remember`` False: it is not stored here, because others change it as well; without a
+        connection it is refused. ``shared``: others change it as well, so after an outage a different value there
+        counts as newer than ours, and stays (T9). ``urgent`` gives commands and flags priority where the backend can.
+        Raises TransportError for a topic that is not allowed.
         """
         check_topic(topic)
         if not isinstance(payload, bytes):
@@ -371,7 +371,7 @@ class Transport(ABC):
         message = Message(topic, payload, qos if type(qos) is QoS else QoS(qos), retain)
         if (forms := self.policy.forms) is None:
             return self._publish(message, urgent=urgent, remember=remember, shared=shared)
-        # Several messages in place of this one, such as a stop with the sender's name and one without it.
+        # Several in place of this one, such as a stop with the sender's name and one without; the first decides.
         outcomes = [self._publish(form, urgent=urgent, remember=remember, shared=shared) for form in forms(message)]
         return outcomes[0]
 
@@ -381,7 +381,7 @@ class Transport(ABC):
                 self.counters.add("refused")
                 return False
             accepted = self._send(message, urgent)
-            sent = accepted and self._state is State.CONNECTED
+            sent = accepted and self._state is State.CONNECTED  # in CONNECTING a hub still has to get it
             stored = message.retain and remember and self._own.remember(message, sent=sent, shared=shared)
             if accepted:
                 self._count_sent()
@@ -474,10 +474,10 @@ class Transport(ABC):
             self._own.send_again(known_topics, lambda message: self._send(message, False))
 
     def _initial_sync(self, known_topics: Collection[str]) -> None:
-        """Finish a new connection that has its subscriptions: send the retained messages it lacks, and set CONNECTED.
+        """Finish a new connection that has its subscriptions: send what the other end lacks, and set CONNECTED.
 
-        Until then the ``_send`` of a backend that calls this accepts messages only while ``_own.syncing``: retained
-        messages that are published in the meantime are pending, and sent last.
+        Until then the ``_send`` of a backend that calls this accepts only these messages (while ``_own.syncing``).
+        Retained messages that are published meanwhile become pending: the second sync sends them.
         """
         self._sync_retained(known_topics)
         self._set_state(State.CONNECTED)

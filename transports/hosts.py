@@ -127,7 +127,7 @@ class AddressRound:
         self._failures.pop(address.text, None)  # so that the newest failure is the last
         self._failures[address.text] = why
         if held_s >= STEADY_S:
-            self._steady, self._left = address, []
+            self._steady, self._left = address, []  # this round is over: the next begins with it
         if self.is_over:
             self._is_first = False
         return described(self._failures)

@@ -11,7 +11,7 @@ BYTES = 16 << 20  # the same, with their payloads
 
 
 class OwnRetained(BoundedTable[Message]):
-    """The newest message of each topic, empty payloads included. The transport's lock of publishing guards the rest."""
+    """The newest message of each topic, even an empty one. The transport's lock of publishing guards its attributes."""
 
     def __init__(self, counters: Counters) -> None:
         super().__init__(LIMIT, BYTES, lambda message: len(message.payload))

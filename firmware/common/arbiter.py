@@ -48,8 +48,8 @@ class Arbiter:
 
         ``moves``: any axis is not 0. ``run`` may be PERSON, or UNKNOWN_RUN for a zero. ``valid_ms`` < 0: not given.
         ``key`` and ``by`` are as in the lease; ``by`` None: a program of the robot, which needs no key. Where names are
-        not checked, scripts need none either. A zero of a client without control ends a script, too, but releases
-        nothing.
+        not checked, scripts need none either. A zero of a client without control ends a script, too, but not the
+        latch's wait for a zero after a reset.
         """
         self.tick(now)
         lease = self.lease
@@ -60,7 +60,7 @@ class Arbiter:
             run = PERSON
         if lease.refuses(moves, run != PERSON or local, key, "" if local else by, now):
             return REFUSED
-        ours = run != PERSON or not lease.key or lease.holds(key, by)  # a script's, or of one who may release
+        ours = run != PERSON or not lease.key or lease.holds(key, by)  # if so, a zero may end the latch's wait
         if newer(run, self.barred) and run != self._newest:  # it has begun, even if this command is refused
             self._newest = run
             self.bar(run - 1 or LAST_RUN)
@@ -106,8 +106,8 @@ class Arbiter:
     def _take(self, moves: bool, final: bool, now: int) -> None:
         """Handle a person's command: scripts wait, or end. ``final``: a zero ends them in any case.
 
-        Another zero ends a script only if that was in effect, which none is after the person's first command: then it
-        ends only the person's own driving.
+        Any other zero ends a script only if that was driving until now. After an earlier command of the person it
+        waits already: then the zero ends only the person's own driving, and the script goes on after the hold.
         """
         if not moves and (final or self._scripted):
             self.bar(self._newest)

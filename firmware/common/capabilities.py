@@ -19,7 +19,7 @@ _CAPABILITIES = const(
 def describe(epoch_ms: int, root: bytes, name: str, stops, charging: bytes, axes: bytes, groups: bytes) -> bytes:
     """Return the payload; ``root`` is the base of the topics, ``name`` the robot's name for people, or empty.
 
-    ``stops`` is the `EmergencyStop`. The others are pieces of JSON. ``charging``: whether it reports that status.
+    ``stops`` is the `EmergencyStop`. The others are pieces of JSON. ``charging``: true if it reports that status.
     ``axes``: those besides x and z, such as ``,"y"``. ``groups``: what it takes in a group of commands, such as
     ``"groups":["drive-values"],``; empty: it takes none.
     """
@@ -28,4 +28,5 @@ def describe(epoch_ms: int, root: bytes, name: str, stops, charging: bytes, axes
     values = [epoch_ms, groups + (b'"named":true,' if stops.names else b"")] + root.split(b"/")
     values += [named, axes, can if stops.controllable else cannot, root, can if stops.stoppable else cannot]
     values += [root, root, root, charging, root, root]
+    # in the order of the template; what follows are the seven from video to git_pull, which no board offers
     return _CAPABILITIES % tuple(values + [b'{"available":false,"controls":false}'] * 7)

@@ -30,7 +30,7 @@ _PONG = const(0x32)
 
 
 class Described:
-    """A board that answers the host. ``manifest`` is the payload of DESCRIBE; its frame fits ``ring``.
+    """A board that answers the host. ``manifest`` is the payload of DESCRIBE; its frame fits ``ring`` bytes.
 
     The first ``hello`` bytes of the manifest are the payload of HELLO. Call ``receive`` at the beginning of each turn,
     ``port.send`` at its end. ``now`` wraps after 2**30 ms.
@@ -45,7 +45,7 @@ class Described:
         self.ctrl_c = _CTRL_C  # a DESCRIBE_REQ begins with 3, which is Ctrl-C: see common/run.py
         self.decoder = Decoder()
         self._manifest, self._hello = manifest, hello
-        self._others = 0  # sequence number: a gap shows lost frames
+        self._others = 0  # number of the newest frame of no interface: a gap shows lost ones
         self._lost = 0  # frames for which there was no room
         self.asked = False  # for a DESCRIBE, which has not been sent yet
         self.notify(manifest[:hello], _HELLO)

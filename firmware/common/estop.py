@@ -27,7 +27,7 @@ _HOLDER = const(
 
 
 class EmergencyStop:
-    """The stop and the control. Pass messages to ``stop``, ``reset``, then ``save`` while motors are off; ``tick``."""
+    """Stop and control. Pass messages to ``stop``, ``reset``, ``request``; ``tick`` each turn, ``save`` at rest."""
 
     def __init__(self, now: int, watchdog_ms: int, strangers: int, names) -> None:
         """Store the arguments; ``strangers``: see `Lease`. ``names``: names.py; None: accounts of senders are ""."""
@@ -35,7 +35,7 @@ class EmergencyStop:
         self.lease = Lease(now, diff, _random, strangers)
         self.arbiter = Arbiter(self.latch, self.lease, now, diff, watchdog_ms)
         self.changed = True  # since the last state
-        self.due = b""  # the state to publish: at most four a second, and that of a stop not in its turn
+        self.due = b""  # the topic of the state to publish now, that of the stop first; at most four states a second
         self.names = names
         self.stoppable = self.controllable = True  # the broker granted the topics of stops, and of control
         self._barred = 0  # of the last state

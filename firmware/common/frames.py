@@ -83,7 +83,7 @@ class Sender:
 
 
 class Decoder:
-    """Decodes the host's bytes. After a byte that completes a valid frame, the attributes hold its parts."""
+    """A decoder of the host's bytes. After a byte that completes a valid frame, the attributes hold its parts."""
 
     def __init__(self) -> None:
         self.kind = self.interface = self.sequence = self.size = 0
@@ -96,7 +96,7 @@ class Decoder:
         if byte:
             if length < _LIMIT:
                 self.data[length] = byte
-            self._length += length <= _LIMIT  # one more than fits: too long
+            self._length += length <= _LIMIT  # counts to one more than fits, which shows that it is too long
             return False
         self._length = 0
         return 0 < length <= _LIMIT and self._parse(self._unstuff(length) - 2)

@@ -97,7 +97,7 @@ class Lines:
 
 
 def _after(line: bytearray, at: int, end: int, blanks: bool) -> int:
-    """Return the end of the blanks, or else of the other bytes, that start at ``at``."""
+    """Return where the row of blanks that starts at ``at`` ends; ``blanks`` False: the row of other bytes."""
     while at < end and (line[at] == _BLANK or 9 <= line[at] <= 13) == blanks:
         at += 1
     return at

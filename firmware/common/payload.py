@@ -45,8 +45,8 @@ def parse(raw: memoryview | bytes, grouped: bool = False) -> tuple[float, float,
     """Return ``(x, z, y, run, valid_ms, key)`` from bare or wrapped JSON; None if the command is refused.
 
     Axes are limited to -1..1; missing ones, and those that are no number, are 0; NaN and infinity are refused. The
-    other values are as the arbiter needs them. If one of these or ``source`` is wrong, only a stop is admitted.
-    ``grouped``: the command is a member of a group. If that has other members, too, only a stop is admitted.
+    other values are as the arbiter needs them. If one of these or ``source`` is wrong, only a zero is admitted.
+    ``grouped``: the command is a member of a group. If that has other members, too, only a zero is admitted.
     """
     try:
         body = load(raw)

@@ -95,8 +95,8 @@ class Client:
     def _publication(self, first: int, at: int, stop: int) -> None:
         """Acknowledge a publication, even one too long to be stored: else the broker holds back the next ones."""
         data = self.data
-        topic = at + 2 + (data[at] << 8 | data[at + 1]) if stop - at > 1 else stop + 1
-        body = topic + (first & 6)  # behind a packet id of two bytes if its QoS is 1, whose flag is a 2 as well
+        topic = at + 2 + (data[at] << 8 | data[at + 1]) if stop - at > 1 else stop + 1  # the topic's end
+        body = topic + (first & 6)  # with QoS 1, whose bit is a 2, the packet id of 2 bytes is between them
         if first & 4 or body > stop or body > self._end:
             raise ValueError("publication")
         if body > topic:

@@ -49,7 +49,7 @@ class NetworkRobot:
         self._wifi = Wifi(get(settings, "wifi", "ssid"), get(settings, "wifi", "password", ""))
         self._clock = Clock(settings.get("ntp", "pool.ntp.org"), now)
         names = None
-        if ("open", "login", "named").index(get(settings, "security", "level", "open")) == 2:
+        if ("open", "login", "named").index(get(settings, "security", "level", "open")) == 2:  # ValueError for others
             from common import names  # type: ignore[assignment]
         words = "drive", "free", "refuse"
         strangers = words.index(get(settings, "security", "strangers", words[2 if names else 1]))
@@ -68,7 +68,7 @@ class NetworkRobot:
         self._limit_ms = 0  # how long it moves the motors
         self._void = False  # a stop was received in this turn
         self._due = now  # the next heartbeat
-        self._heartbeats = 0
+        self._heartbeats = 0  # since the broker granted the topics; before the first one capabilities are published
         self.groups = b""  # the members of groups that it takes; none if the broker refuses their topic
 
     def step(self) -> None:

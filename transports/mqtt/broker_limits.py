@@ -94,7 +94,9 @@ class BrokerLimits:
         self._asking = Asking.AGAIN if result is Result.ACCEPTED else Asking.NOTHING
 
     def note_connect(self, result: Result, now: float) -> None:
-        """Note how a CONNECT with a will, as `limits` have it, has ended. The first line that fits counts.
+        """Note how a CONNECT has ended whose will was fitted to `limits`. The first line that fits counts.
+
+        *Again*: it was sent at once, after an accepted probe or with less than the one before. *First*: any other.
 
         | result                             | tried | the next CONNECT is                                |
         |------------------------------------|-------|----------------------------------------------------|
@@ -103,6 +105,7 @@ class BrokerLimits:
         | hung up                            | again | at once, with less, as long as there is less       |
         | accepted                           | any   | the same                                           |
         | any other                          | again | with everything: the limits were not the reason    |
+        | any other                          | first | the same                                           |
         """
         again, self._asking = self._asking is Asking.AGAIN, Asking.NOTHING
         if result is Result.RETAIN_REFUSED and self.limits.retain:

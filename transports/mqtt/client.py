@@ -197,7 +197,7 @@ class Client:
         if qos:
             mid = self._mid = self._mid % MOST_IDS + 1
         packet = packets.publish(topic, payload, qos, mid, retain=retain, modern=self._modern, expires_s=expires_s)
-        if not qos or self._quota.takes(packet):
+        if not qos or self._quota.takes(packet):  # else the quota keeps it, to send it later
             self._send(packet)
         return mid
 

@@ -95,6 +95,7 @@ class Connection:
         try:
             self._client.open()
         except (OSError, ValueError) as error:
+            # Absent if nothing listens there, TlsLate if TLS takes too long, else Lost.
             ending = next((ending for kind, ending in _UNREACHED.items() if isinstance(error, kind)), Lost)
             raise ending(f"{self.where} cannot be reached: {error}") from None
         self.opened_s = time.monotonic() - dialled
@@ -185,7 +186,7 @@ class Connection:
                 with self._lock:
                     client.acknowledge()
         incoming.age.delay.delivered()
-        if incoming.age.has_retained:
+        if incoming.age.has_retained:  # their handlers may have taken long: the broker was not silent meanwhile
             incoming.age.note_handled()
         if self.in_flight.answered:
             self.in_flight.complete()
@@ -280,7 +281,7 @@ class Connection:
         return _OVERHEAD + len(message.topic.encode()) + len(message.payload) <= self.max_packet
 
     def _is_full(self, message: Message) -> bool:
-        """True if ``message`` may not be sent beyond UNACKED_LIMIT, as a stop may while the reserve lasts."""
+        """True if ``message`` is refused now that UNACKED_LIMIT is reached. A stop is sent while the reserve lasts."""
         beyond = self.in_flight.unacked - UNACKED_LIMIT
         return beyond >= UNACKED_RESERVE or not self._owner.policy.is_stop(message.topic)
 
@@ -304,7 +305,10 @@ class Connection:
         return self._request(self._client.unsubscribe, filters, [])
 
     def _request(self, send: Callable[[Sequence[T]], int], filters: Sequence[T], asked: Sequence[str]) -> PendingAck:
-        """Send a few filters in each packet; return the pending answer to the last. ``asked``: texts of a SUBSCRIBE."""
+        """Send a few filters in each packet; return the pending answer to the last packet.
+
+        ``asked``: the texts of filters to subscribe to, each of which the broker may refuse; empty to unsubscribe.
+        """
         ack = PendingAck()
         with self._lock:
             for at in range(0, len(filters), FILTERS):

@@ -97,7 +97,7 @@ class Incoming:
         if size and self.pings.is_thin:  # any sign of life counts: answers wait behind messages of others
             self.answered_at = clock.since_boot()
         is_inside_packet = size > 0 and self._packets == began_with  # bytes came, but no end of a packet
-        if age.has_retained or is_inside_packet:  # then answers come only after these
+        if age.has_retained or is_inside_packet:  # answers come only after these: the broker is not silent
             age.note_arriving()
         if not self.more:
             age.waiting.empty(age.received_at)

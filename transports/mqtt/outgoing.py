@@ -188,7 +188,7 @@ class InFlightTable:
             if message.qos is QoS.DELIVERED:
                 entry.mid = mid
             else:
-                entry.ping = self._ping_number + 1
+                entry.ping = self._ping_number + 1  # there is no PUBACK: the answer to the next ping confirms it
 
     def acknowledge(self, mid: int, now: float) -> float | None:
         """Process a PUBACK; return the time when its message was sent, None if the message is unknown."""
@@ -256,7 +256,7 @@ class InFlightTable:
         self._newest_s = now - ping.sent_at
         self.measured(self._newest_s)
         for topic, (at, size) in ping.written.items():
-            _note(self._accepted, topic, at, max(size, SMALL))
+            _note(self._accepted, topic, at, max(size, SMALL))  # every broker accepts SMALL
         for topic, entry in list(self._unconfirmed.items()):
             if entry.ping and entry.ping <= self._pong_number:
                 del self._unconfirmed[topic]

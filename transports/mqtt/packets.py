@@ -211,7 +211,7 @@ class Reader:
         self._listener, self._quota, self._modern = listener, quota, modern
         self._data, self._at = b"", 0  # received bytes, and where those begin that are not read yet
         self._partial = bytearray()  # a packet that is not whole
-        self._needed = 0  # bytes of it until more can be read
+        self._needed = 0  # how many bytes it must have before `read` goes on
         self._discarded = 0  # bytes of a long packet that still come
         self._too_long = (b"", 0, b"")  # its topic, its length, and the answer to it
 

@@ -24,7 +24,7 @@ class Pings:
         keepalive_s = settings.keepalive_s or inf  # 0: the broker sets no limit
         self._interval_s = max(_LEAST_S, min(settings.silence_s, keepalive_s) / 4)
         self._thin_interval_s = min(_THIN_INTERVAL_S, keepalive_s / 2)
-        self.is_thin = False
+        self.is_thin = False  # see `Transport.is_thin`
         self.due_at = inf  # once accepted they are sent regularly: other answers come only to what we publish
         #: The beginning of the last time without reading for which a ping was sent.
         self._stalled_since = age.waiting.checked_at
@@ -34,13 +34,14 @@ class Pings:
         self.due_at = now + self._interval_s
 
     def send(self, client: Client, ack: PendingAck | None = None) -> None:
+        """Send a ping, and set when the next one is due. If much data is ahead of it, its answer tells no delay."""
         sock = client.socket
-        ahead = client.unwritten + (0 if sock is None else unconfirmed_bytes(sock))
+        bytes_ahead = client.unwritten + (0 if sock is None else unconfirmed_bytes(sock))
         now = clock.since_boot()
         interval_s = self._thin_interval_s if self.is_thin else self._interval_s
         self.due_at = now + interval_s * random.uniform(_LEAST_SHARE, 1.0)  # noqa: S311  (no secret)
         self._in_flight.ping(now, ack)
-        self._age.delay.asked(now, clear=ahead <= _CLEAR)
+        self._age.delay.asked(now, clear=bytes_ahead <= _CLEAR)
         client.ping()
 
     def send_after_stall(self, client: Client, now: float) -> None:

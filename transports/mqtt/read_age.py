@@ -95,7 +95,7 @@ class BrokerDelay:
             self._read = ping.sent_at, took_s
             self._newest = took_s if ping.clear else 0.0
             self.usual(took_s)
-        is_near = self._shortest <= _NEAR_S
+        is_near = self._shortest <= _NEAR_S  # further off, every answer comes soon after some newer ping
         if is_near and self._pings and now - self._pings[-1].sent_at <= self._shortest + _NEAR_S:
             self._prompt += 1
         else:
@@ -143,6 +143,7 @@ class BrokerDelay:
         waited = max(self._newest, now - since, self._stall if now < self._until else 0.0)
         if waited <= self._shortest + _NOTICED_S:
             return 0.0
+        # TCP's present round trip, within bounds: at least the usual one, at most so much longer.
         way_s = max(self._shortest, min(round_trip_s(), self._shortest + _UPLINK_S))
         return waited - way_s
 

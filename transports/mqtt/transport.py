@@ -131,10 +131,10 @@ class MqttTransport(Transport):
             why = f"{len(message.payload)} bytes, but it takes packets of {connection.max_packet} at most"
             self._refused.report(connection.where, message.topic, why, time.monotonic(), logging.ERROR)
             self.counters.add("too_large")
-            return True
+            return True  # as if it were sent: nothing may wait behind it
         if self._refused.withheld and not self._refused.admits(message, time.monotonic()):
             self.counters.add("withheld")
-            return True  # as if it were sent: nothing may wait behind it
+            return True  # here, too
         expires_s = ceil(self.settings.silence_s) if urgent and not message.retain else None
         if message.retain:
             self._own_message_filter.note_own(message)

@@ -121,11 +121,12 @@ class Guard:
         return active
 
     def _help(self) -> None:
+        """Give another of Zenoh's threads something to do: the task that Zenoh starts for a query's time limit."""
         self.helped += 1
         with self._lock:
             sessions = self._sessions[::-1]
         for session in sessions:
-            try:  # a query has a time limit, for which Zenoh starts a task; this one does not leave the session
+            try:  # the query does not leave the session
                 session.get(_NOTHING, _nothing, timeout=_HELP_S, allowed_destination=zenoh.Locality.SESSION_LOCAL)
             except Exception:  # closed meanwhile; whatever it is, the guard goes on
                 log.debug("no help from a session", exc_info=True)

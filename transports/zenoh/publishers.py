@@ -25,7 +25,7 @@ class Publishers:
     def __init__(self, is_invented: Callable[[str], bool]) -> None:
         self._is_invented = is_invented
         self.declared: dict[tuple[str, QoS], zenoh.Publisher] = {}
-        self.thread = 0  # the identifier of the thread that is inside `put`
+        self.thread = 0  # the thread inside `put`: Zenoh calls this session's own subscribers on it
         # Of each topic, as its first message was: with two priorities, its messages would overtake each other (T3).
         self._urgent: dict[str, bool] = {}
 
@@ -43,7 +43,7 @@ class Publishers:
             self.thread = 0
 
     def put_late(self, session: zenoh.Session, message: Message) -> None:
-        """Send a retained message that others have missed. This client gets it from the hub."""
+        """Send a retained message that others have missed, not to this client, which gets it from the hub."""
         treatment = wire.TREATMENTS[message.qos, self._urgent.get(message.topic, False)]
         stamp = wire.pack_live(message.qos, retain_requested=message.retain)
         key, others = topic_to_key(message.topic), zenoh.Locality.REMOTE

@@ -53,6 +53,7 @@ class ZenohTransport(Transport):
         self._reset()
 
     def _reset(self) -> None:
+        """Make what belongs to one opening: a closed transport may be opened again."""
         self._hub.open()
         self._pid = os.getpid()
         self._ages = MessageAges(wire.BOOT, self.settings.lease_ms / 1000)
@@ -62,7 +63,7 @@ class ZenohTransport(Transport):
         self._session: zenoh.Session | None = None
         self._publishers.declared.clear()
         self._loopback = LoopbackQueue(self.counters)
-        self._opened = threading.Event()
+        self._opened = threading.Event()  # set after the first wait for siblings
         self._thread: threading.Thread | None = None
 
     @property
@@ -114,6 +115,7 @@ class ZenohTransport(Transport):
         return False
 
     def _begin(self, session: zenoh.Session, name: str) -> bool:
+        """Use ``session`` from now on: subscribe, and watch its hubs. False if this transport was closed meanwhile."""
         with self._hub.lock:
             if self._hub.watch.closed:
                 sessions.close_session(session)
@@ -174,7 +176,12 @@ class ZenohTransport(Transport):
             version = view.version
 
     def _synchronize(self, timeout: float) -> dict[str, int]:
-        """Wait until all siblings know our declarations; return how many retained messages each has sent."""
+        """Wait until siblings and hub know our declarations; return how many retained messages each sibling has sent.
+
+        Each sibling sends its own retained messages to the hub, and some may still be on their way there: with the
+        counts, `HubConnection.fetch` lets the hub answer only after these. Siblings on other machines (`_elsewhere`)
+        are in no run directory here, so only the hub is waited for.
+        """
         if self._barrier is None:
             return {}
 
@@ -192,7 +199,11 @@ class ZenohTransport(Transport):
         self._opened.set()
 
     def _follow(self, view: HubView, seen: int, linked: int) -> int:
-        """Process a change of hubs or connections; return the number of the working hub connection, 0 for none."""
+        """Process a change of hubs or connections; return the serial number of the working hub connection, 0 for none.
+
+        The number grows with each hub that appears. ``linked``: the result of the last call, or 0 after an error;
+        ``seen``: the version of the view then. Without a change this is another try, after a failed one.
+        """
         if not view.hubs:
             self.problem = f"the hub of {self.settings.run_dir} is away"
             self._set_state(State.CONNECTING)

@@ -152,7 +152,7 @@ def asked(what: str, account: str) -> str:
 def ask(session: zenoh.Session, key: str, payload: bytes, timeout: float) -> bytes | None:
     """Send a query to the hub, and return its answer; None if none comes within ``timeout`` seconds.
 
-    Where a hub has just died, the query ends for others long after the next hub has answered it.
+    It returns with the first answer: where a hub has just died, the query ends long after the next hub has answered.
     """
     replies: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()  # None: the query has ended
     session.get(

@@ -36,6 +36,7 @@ class _Paho(paho.Client):
         return begin_tls(tcp_sock, self.opening)  # paho waits for 2 s, whatever arrives
 
     def _sock_recv(self, bufsize: int) -> bytes:
+        """Return bytes that `PahoClient.receive` took out of the socket, from which paho itself reads nothing."""
         if self.begin == len(self.ahead):
             raise BlockingIOError
         if self._too_long:  # discard what paho has collected of the packet after its head
@@ -88,7 +89,8 @@ class PahoClient:
 
     def __init__(self, opening: Opening, listener: Listener, *, bridge: bool) -> None:
         client_id, settings, context, will, *_ = opening
-        self.drained, self.hung_up = True, True  # hung_up: paho does not say why a write has failed
+        self.drained = True
+        self.hung_up = True  # so that a failed write counts as a hang-up: paho does not say why it failed
         self._settings, self._context, self._listener = settings, context, listener
         self._modern = settings.protocol == "5"
         protocol = MQTTProtocolVersion.MQTTv5 if self._modern else MQTTProtocolVersion.MQTTv311

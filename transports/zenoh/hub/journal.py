@@ -103,6 +103,7 @@ class Journal:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             os.close(os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
             self._database = sqlite3.connect(self.path, isolation_level=None, check_same_thread=False)
+            # No automatic checkpoints: they would sync to disk in `put`. `_sync` makes them.
             for pragma in ("journal_mode = WAL", "synchronous = NORMAL", "wal_autocheckpoint = 0"):
                 self._database.execute(f"PRAGMA {pragma}")
             self._database.execute("CREATE TABLE IF NOT EXISTS records (name TEXT PRIMARY KEY, record BLOB)")

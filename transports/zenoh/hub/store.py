@@ -65,6 +65,7 @@ class HubStore:
         return retained.stamp.origin == client and digest(retained.payload) != its_digest
 
     def _store_retained(self, record: Retained) -> bool:
+        """Store a retained message, or remove it if ``record`` has no payload; return as `apply` does."""
         before = self._retained.get(record.key)
         after = record if record.payload else None
         if not self._resize(_size(after) - _size(before)):
@@ -77,6 +78,7 @@ class HubStore:
         return before != after
 
     def _store_will(self, record: StoredWill) -> bool:
+        """Store a will, or remove it if ``record`` has none; return as `apply` does."""
         name, before, after = record.name, self._wills.get(record.name), record.will
         if after is not None:
             full = before is None and len(self._wills) >= self._max_wills

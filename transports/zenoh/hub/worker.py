@@ -40,7 +40,7 @@ class HubWorker:
         self._store, self._journal, self._counters, self._admission = store, journal, counters, admission
         self.alive_clients: set[str] = set()
         self._name, self._wills = name, WillTimes()
-        self._has_met = False  # another hub was there
+        self._has_met = False  # another hub; it was logged
         self._token: zenoh.LivelinessToken | None = None
         self._waiting, self._intake = WaitingQueries(), Intake()
         self._session: zenoh.Session | None = None
