@@ -124,7 +124,7 @@ class MediaFeed:
         return next((name for name in _WITHOUT_PYAV[self._medium] if name in encodings), _AS_CONFIGURED)
 
     def _take_picture(self, payload: bytes) -> bool:
-        """True if the payload is a picture that can be shown. If pictures are missing, a key frame is requested."""
+        """True if the payload is a picture. If one before it is missing, a key frame is requested."""
         header = self._sequence.take(payload)
         if header is None:
             return False

@@ -120,7 +120,7 @@ class Server:
                 self.dropped += 1
                 return
             self.published += 1
-            if remember or topic in self._remembered:
+            if remember or topic in self._remembered:  # later clients must not be sent an older message than this one
                 self._remember(topic, _Remembered(data, log_ns))
         channel.log(data, log_time=log_ns)
 

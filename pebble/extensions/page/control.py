@@ -253,7 +253,7 @@ class Control:
             self._audit("drive", op.ref)
 
     def _end_stop(self, op: m.EstopEndOp) -> None:
-        """End a stop of this person, or any stop with the right to reset: a viewer must not end another's stop."""
+        """End a stop of this person or, for a person who may reset, any stop: a viewer must not end another's."""
         user = self._server.stops.user(op.stop)
         if user is not None and (user == self._session.user or self._may("reset", op)):
             self._server.stops.end(op.stop)
@@ -303,7 +303,8 @@ class Control:
                 self._audit("release", op.ref)
             return
         robot, driven = server.robots.view(op.ref), server.drivers.robot(op.ref)
-        # pages may take from each other what only this server gives
+        # To take over a robot that itself decides who drives it needs a right of its own. Where only this server
+        # decides, all pages that may drive may take control from each other.
         right = "take" if op.over and driven.keeps else "drive"
         if not self._may(right, op):
             return

@@ -30,7 +30,7 @@ STEP_S = 1.0  # between two changes of what is received of one component: capabi
 
 
 class _Meaning(NamedTuple):
-    """The component and channel of a topic, for one whose own name does not tell them."""
+    """The component and channel of a topic that does not tell them by its own name."""
 
     ref: str
     channel: c.Channel

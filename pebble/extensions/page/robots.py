@@ -293,7 +293,7 @@ class Robots:
         """True if a value may be stored. States of motor owners always may, as stop and control depend on them."""
         if component.lists(metric):
             return True
-        is_new = metric not in component.values
+        is_new = metric not in component.values  # of channels that are no patterns there are few
         if is_new and len(component.values) >= MAX_METRICS and channel.is_pattern:
             return False
         return self._bytes + more_bytes <= MAX_BYTES or self.is_kept(component.ref)
@@ -317,7 +317,7 @@ class Robots:
             return False
         self._bytes += more_bytes
         component.values[metric] = _Value(msgspec.Raw(raw), now)
-        if channel is not c.ONLINE:
+        if channel is not c.ONLINE:  # heartbeats are sent with the liveness, less often: see _refresh
             self._mark(component.ref, metric)
         return True
 

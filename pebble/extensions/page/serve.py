@@ -60,7 +60,8 @@ async def _report_start(
     """Call ``on_ready`` with the address once the server accepts connections."""
     while not server.started:
         await asyncio.sleep(0.02)
-    listener.listen(_WAITING)  # asyncio has called it with _ACCEPT: its backlog means both
+    # asyncio takes its backlog, _ACCEPT, for both: how many it accepts at once, and how many may wait for that.
+    listener.listen(_WAITING)  # changes only how many may wait
     if on_ready is not None:
         on_ready(url)
 

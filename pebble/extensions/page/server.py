@@ -54,6 +54,7 @@ class Server:
     def __init__(self, settings: WebSettings, people: People, audit: Audit) -> None:
         self.settings, self.people, self.audit = settings, people, audit
         self._base = Identity("pebble", SERVERS, f"{settings.name}-{secrets.token_hex(2)}").base
+        # The second one only publishes stops: no message that is received delays them.
         self.broker, self.stop_broker = (
             Broker(in_small_segments(settings.broker), name) for name in ("pebble-web", "pebble-web-stops")
         )
@@ -70,6 +71,7 @@ class Server:
         self.sources = ChosenSources(people, self.robots, self.open_components.update)
         self.boards = SilentBoards(self.broker, self.robots, self.drivers, people, settings)
         self.drivers.refusals.is_stopping = self.stops.holds
+        # The table of robots is bounded, and does not know what is open, driven or stopped.
         self.robots.is_wanted = self._is_wanted
         self.robots.is_kept = lambda ref: self._is_wanted(ref) or self.stops.sends_to(ref)
         self.robots.on_forget = self._ask_anew
@@ -85,6 +87,7 @@ class Server:
         self._show_broker()
         for channel in (*FLEET, *SYNONYMS):
             filter_, is_heartbeat = channel.filter("+/+/+"), channel is ONLINE or channel in SYNONYMS
+            # Heartbeats are so many that they do not wake the event loop: they wait for _tick.
             subscription = await self.broker.subscribe(filter_, self.receive, deferred=is_heartbeat)
             self._fleet_subscriptions.append(subscription)
         self.spawn(self._tick())

@@ -96,7 +96,7 @@ class SilentBoards:
         return ""
 
     def _follow(self, component: Component, board: _Board, now: float, spawn: Spawn) -> None:
-        """Go on with a board: know it for a while, read its drive topic, then let pages drive it."""
+        """Subscribe to a board's drive topic once it was online for HEARD_S; after that let pages drive it."""
         ref, robot = component.ref, component.robot
         if board.permission is None:
             if not robot.online(now):
@@ -119,8 +119,9 @@ class SilentBoards:
     def _permission(self, ref: str) -> Permission:
         """Return the permission that the config gives or refuses, or else the one that a person has stored."""
         listed = self._listed.get(ref, ListedRobot())
-        if self._refusal(ref):  # no person can change it: the config decides
-            takes_plain_commands = listed.plain or not self._is_named  # without a name in the topic
+        if self._refusal(ref):  # no person may decide, so the config does
+            # At level named a board gets commands only if its account takes them without a name in the topic.
+            takes_plain_commands = listed.plain or not self._is_named
             is_allowed = listed.drive and takes_plain_commands
             return Permission("the config", listed.axes) if is_allowed else Permission()
         try:

@@ -26,7 +26,7 @@ _TYPES = {
     "webmanifest": "application/manifest+json",
     "woff2": "font/woff2",
 }
-_PACKED = {"png", "woff2"}  # compressed already
+_COMPRESSED = {"png", "woff2"}  # by their format: they are neither stripped nor compressed again
 _VERSION = b"{version}"  # in the pages, replaced by that of the files
 _ROOT = b"{root}"  # replaced by root_of(): a proxy may show the server below a path that only browsers know
 _START = b"{start}"  # replaced by start.js, which needs no request of its own
@@ -128,7 +128,7 @@ def root_of(request: Request) -> str:
 
 
 def _packed(name: str, content: bytes) -> bytes | None:
-    return None if name.rpartition(".")[2] in _PACKED else gzip.compress(content, 9, mtime=0)
+    return None if name.rpartition(".")[2] in _COMPRESSED else gzip.compress(content, 9, mtime=0)
 
 
 def _response(request: Request, name: str, content: bytes, packed: bytes | None, headers: dict[str, str]) -> Response:
@@ -145,7 +145,7 @@ def _read(folder: Traversable, path: str) -> Iterator[tuple[str, bytes]]:
             yield from _read(entry, f"{path}{entry.name}/")
         elif suffix in _TYPES:
             content = entry.read_bytes()
-            yield path + entry.name, content if suffix in _PACKED else stripped(content, suffix)
+            yield path + entry.name, content if suffix in _COMPRESSED else stripped(content, suffix)
 
 
 def stripped(source: bytes, suffix: str) -> bytes:

@@ -80,6 +80,7 @@ class Stops:
         named, bases = [ref] if ref else None, [robot.base for robot in robots]
         sender = StopSender(name, by=by, why=why, now=now, robots=named, known=bases, own_only=True)
         older = self._by_ref.get(ref)
+        # A stop that others have pressed, too, has no user: none of them may end it.
         pressed_by_others = older is not None and not older.is_over and older.user != user
         if older is not None:
             self._remove(older)

@@ -155,7 +155,7 @@ class LinkMeter:
         elif self._rests_since is None:
             self._rests_since = now
         elif now - self._rests_since >= self._rise_s[level]:
-            self._change(_ORDER[_ORDER.index(level) - 1])
+            self._change(_ORDER[_ORDER.index(level) - 1])  # the next better one; at "wide" rise_s is infinite
             self._risen_at = now
 
     def _fall(self, now: float) -> None:

@@ -67,7 +67,7 @@ class Sifter:
             sieve = self._sieve
             if sieve is not None and self._sides.gate is Gate.OPEN and sieve.keeps(subject, message, forward):
                 return Drop.NO_ROOM
-            return self._forwarder.pass_now(source, subject, message, forward)
+            return self._forwarder.pass_now(source, subject, message, forward)  # the robot's own has no account
 
     def _joins(self, subject: Subject, message: Message, forward: Forward) -> bool:
         """True if a message may leave in a group of streams."""

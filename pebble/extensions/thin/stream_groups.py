@@ -24,6 +24,7 @@ from pebble.transports.counters import Counters
 _MOST_STREAMS, _MOST_BYTES = 64, 2048  # in a group, and of each of them; others are sent by themselves
 _LEARN_S, _LEARN_AGAIN_S = 3.0, 60.0  # until a group is the dictionary of later ones: by then it has all streams
 _CROWDED = 4  # so much longer between two groups, while a queue stands
+_EARLY_S = 0.01  # a call that comes so much too early sends a group, too: the next one is POLL_S later
 _TRIES = 5  # of a short name that no expander hears
 log = logging.getLogger(__name__)
 
@@ -61,7 +62,7 @@ class StreamGroups:
         self._is_announced = False
 
     def heard(self, raw: bytes) -> None:
-        """Note an expander's announcement. If it does not name our short topic, publish an empty group there."""
+        """Note an expander's announcement. If it does not name our short topic, let the expander hear a group there."""
         now = self._clock()
         if now - self._heard_at > HEARD_S:
             self._heard_since, self._tries = now, 0
@@ -71,7 +72,7 @@ class StreamGroups:
         if not self._short:
             return
         self._tries = 0 if self._short_is_heard else self._tries + 1
-        if 1 <= self._tries <= _TRIES:
+        if 1 <= self._tries <= _TRIES:  # with an empty group: its next announcement names the topic then
             self._remote.publish(self._short, b"{}", qos=QoS.LATEST)
         elif self._tries == _TRIES + 1:
             log.warning("no expander hears %s: the broker refuses it, or another robot has it", self._short)
@@ -81,7 +82,9 @@ class StreamGroups:
         metric, payload = message.topic.removeprefix(self._below), message.payload
         if self._contract_only and channel_of(f"{OUTGOING}/{metric}") is None:
             return False
-        if self._clock() - self._heard_at > HEARD_S or metric == message.topic or len(payload) > _MOST_BYTES:
+        is_heard = self._clock() - self._heard_at <= HEARD_S
+        is_outgoing = metric != message.topic  # it was below outgoing/
+        if not is_heard or not is_outgoing or len(payload) > _MOST_BYTES:
             return False
         try:
             msgspec.json.decode(payload)
@@ -105,7 +108,7 @@ class StreamGroups:
                 self._waiting.clear()
             return
         period_s = (_CROWDED if crowded else 1) / self._hz
-        if not self._waiting or now - self._sent_at < period_s - 0.01:
+        if not self._waiting or now - self._sent_at < period_s - _EARLY_S:
             return
         with self._lock:
             waiting = dict(self._waiting)
@@ -116,7 +119,7 @@ class StreamGroups:
             return
         with self._lock:
             for metric, payload in waiting.items():
-                if self._waiting.get(metric) is payload:
+                if self._waiting.get(metric) is payload:  # no newer message has replaced it meanwhile
                     del self._waiting[metric]
         self._sent_at = now
         self._remote.publish(topic, raw, qos=QoS.LATEST)

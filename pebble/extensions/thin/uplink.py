@@ -144,10 +144,11 @@ class ThinUplink(Uplink):
             self._groups = StreamGroups(config, addresses, remote, forwarder.counters, clock)
         self._sifter = Sifter(forwarder, gate or forwarder, self._groups)
         self._late, self._hold = LateRun(), MediaHold(config.on_demand_programs(), notifier.hold)
+        # Late commands show that the broker's queue for this link is long: see _drop_late.
         forwarder.note_age = lambda late: self._late.note(late, clock())
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
         self._heartbeat_at = self._flooded_at = -inf
-        self._shed = 0
+        self._shed = 0  # messages, as logged last
         self._suit_transport()
 
     @property

@@ -122,7 +122,8 @@ def content_type(headers: Headers) -> str:
 def host_names(settings: WebSettings) -> frozenset[str]:
     """Return the names by which browsers may address the server, besides addresses."""
     names = ["localhost"]
-    names += filter(None, map(_without_port, settings.names))  # with a port: it is forwarded to the server's
+    # A name may have a port, which is forwarded to the server's own. Host is compared without ports.
+    names += filter(None, map(_without_port, settings.names))
     if not is_loopback(settings.host):
         names.append(settings.host)
         if settings.certificate is not None:

@@ -99,7 +99,7 @@ def address_of(connection: HTTPConnection) -> str:
 
 
 def _cookie(settings: WebSettings) -> str:
-    """Return the cookie's name. With the prefix, browsers accept it only from this host, over https, for all paths."""
+    """Return the cookie's name. Browsers accept ``__Host-`` names only from this host, over https, for all paths."""
     return "__Host-pebble" if settings.certificate else "pebble"
 
 

@@ -79,8 +79,8 @@ def serve(
         raise PebbleError("which robots is missing: name either a robot's config file or --url mqtt://BROKER")
     require_packages()
     folder = None if tls is None else tls.absolute()
-    is_empty = folder is not None and not all((folder / file).is_file() for file in (SERVER_CERT, SERVER_KEY))
-    usable_folder = None if is_empty else folder
+    is_incomplete = folder is not None and not all((folder / file).is_file() for file in (SERVER_CERT, SERVER_KEY))
+    usable_folder = None if is_incomplete else folder
     if recordings is not None and not recordings.is_dir():
         raise PebbleError(f"--recordings {recordings}: there is no such folder")
     given = {
@@ -94,11 +94,11 @@ def serve(
     if url is not None:
         broker = replace(broker_of("--url", url, password_file, ca_cert), reconnect_max_s=REMOTE_RECONNECT_S)
         settings = _settings_of_url(broker, options, usable_folder)
-        allows_http = False
+        allows_http = False  # only a config can allow it
     else:
         settings, allows_http = _settings_of_config(Path(str(config)), options, usable_folder)
-    needs_certificate = is_empty or (settings.certificate is None and not allows_http)
-    if missing := _missing(settings, needs_certificate=needs_certificate, is_empty=is_empty):
+    needs_certificate = is_incomplete or (settings.certificate is None and not allows_http)
+    if missing := _missing(settings, needs_certificate=needs_certificate, is_incomplete=is_incomplete):
         _print_missing(settings, missing, folder or default_folder() / TLS)
         return 2
     return _run(settings)
@@ -167,12 +167,13 @@ def _default_tls_folder(host: str) -> Path | None:
     return folder if not is_loopback(host) and (folder / SERVER_CERT).is_file() else None
 
 
-def _missing(settings: WebSettings, *, needs_certificate: bool, is_empty: bool) -> list[str]:
+def _missing(settings: WebSettings, *, needs_certificate: bool, is_incomplete: bool) -> list[str]:
     """Return which of "certificate" and "user" are needed and missing.
 
-    A page that only this machine reaches needs neither, unless --tls names a folder that ``is_empty``.
+    A page that only this machine reaches needs neither, unless --tls names a folder that ``is_incomplete``: it lacks
+    the certificate or its key.
     """
-    if not settings.login and not is_empty:
+    if not settings.login and not is_incomplete:
         return []
     missing = ["certificate"] if needs_certificate else []
     if not has_user(settings.people):

@@ -41,9 +41,10 @@ class TerminalDriver:
     ) -> None:
         self.robot, self.name = RobotView(base), id_of(base)
         self.stop: StopSender | None = None
-        self._driven, self._tab = DrivenRobot(base, lambda: self.robot, set()), Tab("", by.partition("@")[0], device)
+        self._driven = DrivenRobot(base, lambda: self.robot, set())  # the set is for pages: none shows this driver
+        self._tab = Tab("", by.partition("@")[0], device)
         self._by, self._speed, self._turn, self._heartbeat = by, speed, turn, heartbeat
-        self._assumes, self._heard_at = assume, float("inf")
+        self._assumes, self._heard_at = assume, float("inf")  # since when the board is online; inf: it is not
         self._willing = True  # to have control as soon as it is free
         self._held: dict[str, tuple[int, float]] = {}  # by axis: the direction, and when its key last arrived
         self._gesture = 0  # the number of the newest one
@@ -86,7 +87,7 @@ class TerminalDriver:
                 self._note = f"this keyboard types {key}: W A S D need a Latin layout; the arrows drive, too"
             if key == ESCAPE:
                 self._escape_at = now
-        if len(keys) >= _BURST:
+        if len(keys) >= _BURST:  # the person may have let go of them long ago
             self.end(now)
 
     def tick(self, now: float, problem: str = "") -> list[Message]:
@@ -98,10 +99,10 @@ class TerminalDriver:
         clock = self._tab.clock
         clock.echo(clock.ping(now), 1000 * now, now)  # at once: no network is between keys and driver
         view = self._driven.shown(self._tab, now)
-        is_published = self.robot.situation(now).published
-        if view.keeps:  # the robot decides who drives it, and says who does
-            is_published = self._driven.published is not None
-        if self._willing and is_published and not view.by and not view.asking:
+        may_request = self.robot.situation(now).published
+        if view.keeps:  # the robot itself decides who drives it: it must have published who does
+            may_request = self._driven.published is not None
+        if self._willing and may_request and not view.by and not view.asking:
             self._take(now, over=False)
         self._out += self._driven.update(now)
         self._reason = f"no connection: {problem}" if problem else self._why_not(now)
@@ -172,7 +173,7 @@ class TerminalDriver:
         view, situation = self._driven.shown(self._tab, now), self.robot.situation(now)
         situation = situation._replace(
             driven=view.by != "" and not view.you,
-            listening=not view.you,
+            listening=not view.you,  # without control this terminal may not drive, even if no other person does
             stopping=self.stop is not None and not self.stop.finished,
         )
         if not self._heartbeat:

@@ -28,7 +28,7 @@ TAKEN_FROM_IDLE_S = 5.0  # a driver who has not moved for so long is not asked
 AWAITED_S = 5.0  # a page that connects again
 
 LET_GO = WORDS["release"]
-ZERO, FINAL_ZERO = Drive(), Drive(valid_ms=0)
+ZERO, FINAL_ZERO = Drive(), Drive(valid_ms=0)  # after a final one, an interrupted script does not resume
 
 
 class State(Enum):
@@ -133,7 +133,8 @@ class DrivenRobot:
     def renew_key(self) -> None:
         """Choose a new key for a new connection to the broker.
 
-        Robots without control compare the ages of commands with one key; those of the old connection must not count.
+        Where no motor owner gives keys, the bridge judges a command's age by the earlier ones with its key. Those of
+        the old connection must not count.
         """
         self._key = secrets.token_hex(4)
 
@@ -169,7 +170,7 @@ class DrivenRobot:
         return self.tab is tab or tab in self._wishes
 
     def awaits(self, token: str, now: float) -> bool:
-        """True if a page with this token recently had control, and no client has it now. It is said only once."""
+        """True if a page with this token recently had control, and no client has it now; later calls return False."""
         awaited, until = self._awaited
         if awaited != token:
             return False
@@ -334,7 +335,8 @@ class DrivenRobot:
         client.update(now)
         had_control = self.client is client
         commands: list[Command] = []
-        if had_control and client.decided != self._given_key:  # lost, or given anew, which needs a new gesture
+        # ``decided`` is the present key of control: empty if control is lost, another one if it was given once more.
+        if had_control and client.decided != self._given_key:
             commands = self._on(Event.LOST, now)
         if client.held and self.client is not client:
             commands += self._give(tab, client, now)
@@ -391,7 +393,7 @@ class DrivenRobot:
         commands = tab.interrupt(op.g, now)  # of another robot that the page moves
         if self._is_assumed:
             self._repeat_zeros(now)
-        is_release = self.tab is tab and not op.final  # by the driver: a script that was interrupted may resume
+        is_release = self.tab is tab and not op.final  # the driver has let go: an interrupted script may resume
         return [Command(self.ref, self._signed(ZERO) if is_release else FINAL_ZERO), *commands]
 
     def _signed(self, drive: Drive) -> Drive:

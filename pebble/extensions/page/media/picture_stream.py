@@ -101,11 +101,11 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
         some_wait = False
         for viewer in self.viewers:
             queue = viewer.queue
-            if queue.rescued or queue.decodes(header.encoding):
+            if queue.rescued or queue.decodes(header.encoding):  # rescued: a key frame may end that
                 queue.offer_direct(frame, now)
                 viewer.wakeup.set()
             some_wait = some_wait or (queue.waiting and not queue.rescued)
-        if some_wait and header.encoding == "h264":
+        if some_wait and header.encoding == "h264":  # of other encodings pages wait patiently: see assess()
             self._request.wake()
 
     def _skip(self, now: float) -> None:
@@ -146,7 +146,7 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
         now = time.monotonic()
         if not self._arrivals.encoding:
             return
-        changing = now - self._request.requested_at < _CHANGE_S
+        changing = now - self._request.requested_at < _CHANGE_S  # to another encoding, which begins with a key frame
         can_rescue = not changing and not rescue.unavailable(self._arrivals.encoding)
         queues = [viewer.queue for viewer in self.viewers]
         wanted = assess(queues, self._arrivals.encoding, now, can_rescue=can_rescue)

@@ -22,8 +22,9 @@ class Talk:
         self._begun_at = float("inf")  # when the page spoke piece 0, as the fastest of its pieces shows
 
     def takes(self, piece: int, now: float) -> bool:
-        """True if this piece, counted from 0 by the page's microphone, arrives in time."""
-        begun_at = now - piece / PIECES_PER_S  # as if this piece had not been delayed
+        """True if piece number ``piece`` of the microphone, from 0, is at most LATE_S later than the fastest one."""
+        begun_at = now - piece / PIECES_PER_S  # when the page spoke piece 0, if this piece was not delayed
+        # With a slow microphone that time moves on with each piece, without any delay: _DRIFT_S lets it.
         self._begun_at = min(self._begun_at + _DRIFT_S, begun_at)
         if begun_at - self._begun_at > LATE_S:
             return False

@@ -138,15 +138,16 @@ class PlayedRobot:
         self.sent = self.skipped = 0  # an output has them; nothing is counted here
         self.moves = False  # a shown recording moves nothing
         self._newest_ns = at_ns  # of what was sent
+        # _begin sets what starts again with each seek. The source calls it, the first time before any message.
         self.player = Player(
             RobotSource(archive, ref, self._begin),
             lambda _channel: True,  # play all channels
             self,
             now=time.monotonic,
             wait=self._wait,
-            since_ns=max(1, at_ns),
+            since_ns=max(1, at_ns),  # at 0 the player would not ask the source for a state
             paused=True,
-            stays=True,
+            stays=True,  # pauses at the end: the page may seek
             longest_gap_ns=_GAP_NS,
         )
         self._link, self._ref = link, ref
