@@ -163,7 +163,7 @@ class Catalogue:
         version = entry, stamp(entry), stamp(folder / MANIFEST)
         version_before, before, until = self._answers.get(name, (None, _Answer(Description()), 0.0))
         is_current = version_before == version and self._clock() < until
-        if is_current or (version_before is not None and not asks):
+        if is_current or (version_before is not None and not asks):  # until it is asked again, the old answer does
             return before
         answer = self._describe(folder, entry, section, asks=asks)
         if not answer.asked:

@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 
 
 class Launch(Struct, frozen=True):
-    """The parameters of a process: ``file`` names the script in the log, ``tie`` ends it with this process."""
+    """The parameters of a process. ``file`` names it in the log; it gets the signal ``tie`` if this one dies."""
 
     file: str
     command: tuple[str, ...]
@@ -115,7 +115,7 @@ class Process:
         poll.register(pipe, select.POLLIN)
         if exited is not None:
             poll.register(exited, select.POLLIN)
-        tick_ms = _TICK_MS if exited is not None else round(1000 * ASKS_S)
+        tick_ms = _TICK_MS if exited is not None else round(1000 * ASKS_S)  # without a descriptor, ask often
         try:
             has_exited = False
             while not has_exited:
@@ -126,7 +126,7 @@ class Process:
                     poll.unregister(pipe)  # it closed its stdout and stderr
                 if output.flooded:
                     time.sleep(PAUSE_S)
-            for _ in range(_LAST_READS):
+            for _ in range(_LAST_READS):  # not without end: programs that it started may still write
                 if not _read(pipe, output):
                     break
             output.end()

@@ -60,7 +60,7 @@ class MotorOwners:
         for barred in [state.last_barred for state in self._states.values()]:
             if not newer(run, barred):
                 ahead = (run - barred) & LAST_RUN
-                yield (barred + ahead // 2) & LAST_RUN or LAST_RUN
+                yield (barred + ahead // 2) & LAST_RUN or LAST_RUN  # half of the way; 0 is no run
 
     @property
     def refusal(self) -> str:

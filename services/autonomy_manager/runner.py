@@ -130,7 +130,7 @@ class Runner:
                 part.child.signal(number)
             for part in run.parts:
                 part.child.wait(end - time.monotonic())
-        self._service.halt(run.number)
+        self._service.halt(run.number)  # again: a script may have driven until its end
         self._run = None
         self._service.end_run(run.number)
         self._service.changed()

@@ -56,6 +56,7 @@ class AutonomyManager(Service):
         super().__init__(*arguments, **options)
         self._section = self.config.section(AutonomyManagerSection)
         motors = self.config.motor_lines()
+        #: With the names of topics that are configured for the serial line of the motors.
         self.addresses = Addresses(view_of(self.config, next(iter(motors), "")))
         self._local = LocalScripts(self.config)
         self._owners = MotorOwners(self.config.motor_owners)
@@ -172,12 +173,12 @@ class AutonomyManager(Service):
         if drive.signed:
             if isinstance(drive.run, int):
                 self._owners.note_run(drive.run)
-        elif drive.source == self.name:
+        elif drive.source == self.name:  # a zero of this manager, see :meth:`halt`
             return
         elif self._signs or drive.key:  # a person's: the script would sign it, or have no key
             self._person_moves = drive.moves
             self.post(self._person_drives, newest_of="person")
-            if not drive.moves and drive.valid_ms == 0:
+            if not drive.moves and drive.valid_ms == 0:  # a final zero: no script resumes after it
                 self.post(self._person_stops, newest_of="person stops")
         else:  # an unsigned script's, or a person's
             self._unsigned_moves = drive.moves
@@ -270,7 +271,7 @@ class AutonomyManager(Service):
         parts = [] if run is None else run.dependencies
         status = AutonomyStatus(
             running=main is not None,
-            timestamp=0.0,
+            timestamp=0.0,  # it is set when this is published: statuses are compared without it
             file=None if main is None else main.file,
             pid=None if main is None else main.child.pid,
             dependencies=[

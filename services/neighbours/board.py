@@ -21,9 +21,9 @@ AWAY_S = silent_after(0.5)  # boards publish four heartbeats a second
 
 
 class BoardNeighbours(NeighboursService):
-    """The neighbours of a board. They announce it to others only while its heartbeats arrive.
+    """The service of a board for its neighbours. It announces the board only while the board's heartbeats arrive.
 
-    This program runs elsewhere, and may outlive the board.
+    It runs on another machine, and may outlive the board.
     """
 
     def __init__(self, *arguments: Any, **options: Any) -> None:

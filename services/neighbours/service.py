@@ -38,7 +38,7 @@ MOST_BYTES = 16 * 1024  # of a message of another robot
 
 
 class NeighboursService(Service):
-    """The neighbours of one robot. ``lan`` replaces the connection to the hub in tests."""
+    """The service of one robot for its neighbours. ``lan`` replaces the connection to the hub in tests."""
 
     name = "neighbours"
     publishes = (DRIVE, NEIGHBOURS, NEIGHBOUR_VALUE)
@@ -47,6 +47,7 @@ class NeighboursService(Service):
         super().__init__(*arguments, **options)
         self._section = self.config.section(NeighboursSection)
         self._me = me = self.config.identity
+        #: With the names of topics that are configured for the serial line of the motors.
         self.addresses = Addresses(view_of(self.config, next(iter(self.config.motor_lines()), "")))
         self._lan = lan or _lan_transport(self.config)
         self._others = {name: Identity(me.system, me.type, name) for name in self._section.listens}

@@ -129,11 +129,14 @@ def _write(
     """Write a new key and its certificate. Without an ``issuer`` it is an authority, which signs itself."""
     key, now = ec.generate_private_key(ec.SECP256R1()), datetime.now(UTC)
     subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, name)])
+    # it begins earlier, for clocks that are late, so it also ends earlier: browsers accept no more days in all
     until = now + timedelta(days=SERVER_DAYS if issuer else _AUTHORITY_DAYS) - _CLOCKS_DIFFER
-    never = ("content_commitment", "key_encipherment", "data_encipherment", "key_agreement")
-    not_used = dict.fromkeys((*never, "encipher_only", "decipher_only"), False)
-    signs = issuer is None
-    usage = x509.KeyUsage(digital_signature=not signs, key_cert_sign=signs, crl_sign=signs, **not_used)
+    other_usages = ("content_commitment", "key_encipherment", "data_encipherment", "key_agreement")
+    not_used = dict.fromkeys((*other_usages, "encipher_only", "decipher_only"), False)
+    is_authority = issuer is None
+    usage = x509.KeyUsage(
+        digital_signature=not is_authority, key_cert_sign=is_authority, crl_sign=is_authority, **not_used
+    )
     builder = (
         x509.CertificateBuilder()
         .subject_name(subject)
@@ -142,7 +145,7 @@ def _write(
         .serial_number(x509.random_serial_number())
         .not_valid_before(now - _CLOCKS_DIFFER)
         .not_valid_after(min(until, issuer.certificate.not_valid_after_utc) if issuer else until)
-        .add_extension(x509.BasicConstraints(ca=signs, path_length=0 if signs else None), critical=True)
+        .add_extension(x509.BasicConstraints(ca=is_authority, path_length=0 if is_authority else None), critical=True)
         .add_extension(usage, critical=True)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
     )

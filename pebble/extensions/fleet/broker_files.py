@@ -44,7 +44,10 @@ def hashed(password: str) -> Hashed:
 
 
 def conf_text(fleet: Fleet, folder: Path, user: str) -> str:
-    """Return the text of `mosquitto.conf`. All its paths are absolute."""
+    """Return the text of `mosquitto.conf`. All its paths are absolute.
+
+    It is a whole configuration or, if the mosquitto of its machine includes it, a part without process and persistence.
+    """
     server = fleet.brokers[0]
     where = f" {server.host}" if is_loopback(server.host) else ""
     tls = [f"cafile {folder / CA_CERT}", f"certfile {folder / SERVER_CERT}", f"keyfile {folder / SERVER_KEY}"]
@@ -60,7 +63,7 @@ def conf_text(fleet: Fleet, folder: Path, user: str) -> str:
     lines += [f"listener {server.port}{where}", *tls, "tls_version tlsv1.2", limit]
     if server.unencrypted is not None:
         lines += [f"listener {server.unencrypted}{where}", limit]
-    if server.included:
+    if server.included:  # for programs of this machine: see Server
         lines += [f"listener {PLAIN_PORT} 127.0.0.1", limit]
     return "\n".join(lines) + "\n"
 

@@ -79,7 +79,7 @@ class CheckedNames(Names):
             return Drop.STALE
         if channel is GROUP and not _is_group(payload):  # several commands in one payload
             return Drop.UNREADABLE
-        fields, by = _object(payload), account
+        fields, by = _object(payload), account  # by: the checked sender, in place of a claim
         if fields is not None:
             body = _body(fields)
             claim = body.get("by")

@@ -100,10 +100,11 @@ def following(run: int) -> int:
 def next_run(config: Config, barred: int = 0, received: int = 0) -> int:
     """Return the number of a run that starts now: newer than ``barred``, which motor owners report.
 
-    It is also above ``received`` and every earlier run of this robot, as far as these are newer than ``barred``. One
-    that a stranger has sent, far ahead, is not: numbers have no end, so it counts as older. Several processes may call
-    this at once. If the file is missing or damaged, it counts from the clock. Raises PebbleError if another process
-    does not release the file.
+    It is also above ``received`` and every earlier run of this robot, as far as these are newer than ``barred``. A
+    number far ahead, as a stranger may send it, counts as older and is left out: the numbers go round.
+
+    Several processes may call this at once. If the file is missing or damaged, it counts from the clock. Raises
+    PebbleError if another process does not release the file.
     """
     return _next(config.state_file("autonomy-run"), barred, time.time, received)
 
@@ -158,10 +159,10 @@ def _from_clock(wall_clock: Callable[[], float]) -> int:
 
 
 def _above(barred: int, *used: int) -> int:
-    """Return the number after the newest of ``barred`` and ``used``.
+    """Return the number after the newest of ``barred`` and ``used``, where 0 stands for none.
 
-    The numbers go round: one that is half of them ahead of ``barred`` counts as older, so a used number is left out if
-    the next one would.
+    The numbers go round: one that is half of them ahead of ``barred`` counts as older. So a used number is left out if
+    the number after it would count as older than ``barred``.
     """
     base = barred or newest(used)
     steps_ahead = [(run - base) & LAST_RUN for run in used if run and newer(following(run), base)]

@@ -413,7 +413,7 @@ def _print_certificate(place: Path, fleet: Fleet, name: str, files: tuple[Path, 
 
 
 def _copies(place: Path, fleet: Fleet) -> Iterator[str]:
-    """Yield the copies of the rules that are not changed with them, each with what to do."""
+    """Yield the copies of the rules on other machines, which a change here does not reach, each with what to do."""
     return applying.copies(Path(_shown(place)), fleet)
 
 

@@ -136,6 +136,10 @@ def _commands(place: Path) -> dict[str, list[str]]:
 
 @contextmanager
 def _running(command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a program during the block, then end it; kill it if that takes too long.
+
+    It has a session of its own, so Ctrl-C reaches only this command, which ends its programs one after the other.
+    """
     from pebble.extensions.media.child import tied_to_parent
 
     process = subprocess.Popen(tied_to_parent(command, signal.SIGTERM), start_new_session=True)

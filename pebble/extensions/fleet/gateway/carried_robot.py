@@ -37,7 +37,7 @@ class NamedSubjects(Subjects):
     """A robot's subjects without renamed topics, but with the topics that have an account's name."""
 
     def _find(self, topic: str) -> Subject | None:
-        """Return the subject of a topic; behind an account's name it is the one of the same topic without a name."""
+        """Return the subject of a topic. A topic with an account's name has that of the same topic without the name."""
         if not topic.startswith(f"{self._base}/{INCOMING}/{BY}/"):
             return super()._find(topic)
         named = without_name(topic)
@@ -89,6 +89,7 @@ class Beginning:
 def begin(robots: Sequence["CarriedRobot"], hub: Transport, broker: Transport) -> None:
     """Start forwarding for ``robots``, beginning with the hub's retained messages.
 
+    These wait until forwarding is open. What comes from the broker would be dropped until then, so it comes after that.
     Waits, for a limited time, for both sides: once for all robots, as a round trip takes longer than everything else.
     """
     _subscribe(robots, Side.LOCAL, hub, f"{OUTGOING}/#", f"{INCOMING}/flags/#")
@@ -129,8 +130,8 @@ class CarriedRobot:
         self.base = base
         self._stops_pass, self._too_large, self._clock, self._beginning = stops_pass, too_large, clock, beginning
         self._subscriptions: list[Subscription] = []
-        #: By the channel of each medium: what allows it, and whether it was requested at the broker; None: not known.
-        self._allowed: dict[Channel, bool] = {}
+        self._allowed: dict[Channel, bool] = {}  # by a medium's channel: its flag is up
+        #: By a medium's channel: the newest request at the broker wants it, or (False) ends it; None: there was none.
         self._requested: dict[Channel, bool | None] = {medium: None for medium, _, _ in _MEDIA}
         self._synchronize_at = self._probe_at = float("-inf")
         self.subjects = NamedSubjects(base)

@@ -85,7 +85,8 @@ class Gateway:
         self._beginning = Beginning()
         self._stop_cycles = Cycles(clock)
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
-        self._lost, self._wake = threading.Event(), threading.Event()
+        self._lost = threading.Event()  # a connection was lost: begin again with every robot
+        self._wake = threading.Event()  # do the next round now
         self._running = True
 
     @property
@@ -117,6 +118,7 @@ class Gateway:
             transport.policy.is_stop = is_stop
             transport.on_state(self._on_state)
         self._presence.on_state(self._on_presence)
+        # For these rules see TopicPolicy. A robot's forwarder decides which of two values of a topic counts.
         self._hub.policy.is_invented = self._is_invented
         self._broker.policy.skips_retained, self._broker.policy.delivers_late = self._skips_retained, True
         for transport in (self._hub, self._stops, self._presence, self._broker):
@@ -137,8 +139,8 @@ class Gateway:
     def tick(self) -> None:
         """Do one round.
 
-        End robots that are silent or carried by another gateway, begin newly heard ones, and publish this gateway's
-        heartbeat.
+        End robots that are silent or carried by another gateway, or all if a connection was lost; begin newly heard
+        ones; publish this gateway's heartbeat.
         """
         if self._lost.is_set():
             self._lost.clear()

@@ -163,7 +163,7 @@ class RobotStop:
         elif self.unconfirmed and (self._order.hold or not self._settled):
             # an owner has restarted, and had not saved the stop: it is sent again
             self.confirmed_s, self._settled = None, False
-            if self._order.hold:
+            if self._order.hold:  # it may be hours old: count how long this confirmation takes
                 self._began = now
             self.next = max(now, self._sent_at + REPEAT_S)
         if self.confirmed_s is not None and not self._settled:

@@ -48,7 +48,7 @@ class NamedTopics:
         if is_stop:
             yield message
         if command is None or not self._is_named(command.identity.base):
-            if not is_stop:
+            if not is_stop:  # else it was yielded above
                 yield message
         elif NAME.fullmatch(self.account):
             payload = _without_claim(message.payload, self.account)

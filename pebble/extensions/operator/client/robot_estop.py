@@ -85,7 +85,10 @@ class RobotEstop:
 
     @property
     def old(self) -> bool:
-        """True if the robot is known to have no emergency stop; False if its broker refuses the topics of the stop."""
+        """True if the robot is known to have no emergency stop.
+
+        If its broker refuses the topics of the stop, its capabilities have a section that says "not available".
+        """
         return self.has_capabilities and not self.announces
 
     def subscribe(self, transport: Transport) -> None:

@@ -43,11 +43,13 @@ class Liveness:
         """Note a heartbeat with the time ``t``, in milliseconds of the component's clock."""
         self._stamps.append(t)
         interval_s = None if self.received_at is None else now - self.received_at
+        # less than robots can be configured for: both waited in a queue; more: a pause, which is no interval
         if interval_s is not None and 0.05 <= interval_s <= 10.0:
             if not self.reported_offline and self.online_to_people(now) is False:  # people had seen it go
                 self._returns.append(now)
             self._intervals.append(interval_s)
-        self.latency_s = max(0.0, latency_s) if -1.0 <= latency_s <= 10.0 else None
+        has_plausible_clock = -1.0 <= latency_s <= 10.0
+        self.latency_s = max(0.0, latency_s) if has_plausible_clock else None
         if self.latency_s is not None:
             self._latencies.append(self.latency_s)
         self.received_at, self.reported_offline = now, not online

@@ -25,7 +25,7 @@ class RobotScripts:
     def __init__(self, names: Names) -> None:
         self.robot = RobotView(names.base)
         self.files: dict[str, Entry] | None = None  # by name; None: the robot has not published any list
-        self.answers = 0  # statuses that arrived live
+        self.answers = 0  # new statuses that were not retained: answers to commands
         self._channels = {names.topic(channel.metric): channel for channel in _RECEIVED}
         self._command_topic = names.topic(AUTONOMY_COMMAND.metric)
 
@@ -48,7 +48,7 @@ class RobotScripts:
         """Update from a message of this robot; malformed ones are ignored."""
         channel, status_before = self._channels.get(message.topic), self.status
         if channel is not AUTONOMY_FILES:
-            self.robot.receive(channel, message, 0.0, 0.0)
+            self.robot.receive(channel, message, 0.0, 0.0)  # nothing here reads times
             if self.status is not status_before and not message.retain:
                 self.answers += 1
         elif len(message.payload) <= _BYTES:

@@ -320,6 +320,7 @@ def _reset(target: Target) -> int:
         robot = view.estop
         put_account_into_topics(transport, names, lambda base: base == robot.base and robot.named)
         robot.subscribe(second)
+        # for ``view.pace``; the times of arrival do not matter
         second.subscribe(LINK.topic(robot.base), lambda message: view.receive(LINK, message, 0.0, 0.0), direct=True)
         wait_for(lambda: robot.has_capabilities, _ANSWER_S)
         second.ask(robot.missing)  # the capabilities may have come after the subscription
@@ -336,7 +337,8 @@ def _reset(target: Target) -> int:
             if not transport.publish(message.topic, message.payload, qos=message.qos, urgent=True):
                 raise TransportError(f"the reset was not sent: {transport.problem or 'the connection was lost'}")
         wait_for(lambda: not reset.waiting, view.pace.answer_s)
-        for owner, why in reset.refusals().items():
+        if refusals := reset.refusals():
+            owner, why = next(iter(refusals.items()))
             raise PebbleError(shown(f"{name} is still stopped: {owner}: {why}; look again, then repeat"))
     typer.echo(f"{name}: free; it moves again once drive commands have paused for half a second")
     return 0

@@ -44,7 +44,7 @@ Quick = Annotated[bool, typer.Option("--quick", help="Few cases and short rounds
 
 
 def host_of(option: str, text: str, parse: Callable[[str], str] | None = None) -> str:
-    """Return the host that an option names. Raises PebbleError."""
+    """Return the host that an option names, as ``parse`` returns it; by default any host. Raises PebbleError."""
     from pebble.config import hosts  # not all commands that use this module have one
 
     try:

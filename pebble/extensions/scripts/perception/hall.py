@@ -67,6 +67,7 @@ class SensorRange:
         return max(-1.0, min(1.0, (value - middle) / swing))
 
     def _end_of_half_wave(self, value: float) -> None:
+        """Count the extremum, and move its end of the range a little to it: the signal may have become smaller."""
         self.extrema += 1
         if self._rising:
             self.high += _FADE * (self._pivot - self.high)
@@ -111,6 +112,7 @@ class PhaseTracker:
         possible = [phase for phase in phases if (phase - self._farthest) * direction >= -_NOISE_RAD]
         if nearest not in possible:
             self.rejected += 1
+            # if both are too far back, the wheel has turned on, into the next wave
             nearest = min(possible or [phase + direction * math.tau for phase in phases], key=distance)
         self.surprise += distance(nearest)
         return self._move_to(self.phase, nearest, power)
@@ -156,7 +158,11 @@ class _Counts:
 
 
 class HallWheel:
-    """A wheel. ``mm_per_step`` is the distance for half a wave."""
+    """A wheel. ``mm_per_step`` is the distance for half a wave.
+
+    During a warm-up the range of the sensor is not known well. So after each extremum all samples until then are
+    tracked again with the better range, which corrects the distance so far.
+    """
 
     def __init__(self, mm_per_step: float) -> None:
         self.mm_per_step = mm_per_step
@@ -168,7 +174,7 @@ class HallWheel:
 
     @property
     def ready(self) -> bool:
-        """True if earlier distances will not be corrected any more, or there are none yet."""
+        """True if the distance so far is final: the warm-up is over, or the wheel has not turned yet."""
         return self._warm_up is None or not self._range.swings
 
     @property
@@ -194,7 +200,7 @@ class HallWheel:
         return self._tracker.rejected
 
     def update(self, sample: HallSample) -> float:
-        """Return the distance since the last sample, in mm. Until :attr:`ready` it may correct earlier results."""
+        """Return the distance since the last sample, in mm; in the warm-up with the corrections of earlier ones."""
         extrema_before = self._range.extrema
         self._range.update(sample.value)
         if sample.quadrature is not None:
@@ -211,7 +217,10 @@ class HallWheel:
         return self.mm - before
 
     def _bound_warm_up(self, samples: list[HallSample]) -> None:
-        """Limit the samples of the warm-up: end it if an extreme was seen, otherwise forget their older half."""
+        """Limit the samples that are kept, as a slow wheel shows few extrema.
+
+        If one was seen, end the warm-up with the range so far. Otherwise forget the older half of the samples.
+        """
         if len(samples) < _WARM_UP_SAMPLES:
             return
         if self._range.extrema:
@@ -251,21 +260,22 @@ class HallWheel:
         """Return the factor that lets the second sensor's level agree with the commands: 1 or −1; 0 if neither does."""
         if not self._second.swings or self._second.extrema < 1:
             return 0
-        agreed = total = 0.0  # motion in the commanded direction (against it: negative), and in any
-        run = 0.0  # the motion since the direction changed
+        agreed = 0.0  # the motion in the commanded direction; against it: negative
+        total = 0.0  # the motion in any direction: the net one of each stretch, as noise goes back and forth
+        since_change = 0.0  # the motion since the commanded direction changed
         last_phase, last_direction = 0.0, 0
         for sample in samples:
             if sample.quadrature is None:
                 return 0
             phase = math.atan2(self._range.level(sample.value), -self._second.level(sample.quadrature))
             if sample.direction != last_direction:
-                total, run = total + abs(run), 0.0
+                total, since_change = total + abs(since_change), 0.0
             elif sample.direction:
                 moved = math.remainder(phase - last_phase, math.tau)
-                run += moved
+                since_change += moved
                 agreed += moved * sample.direction
             last_phase, last_direction = phase, sample.direction
-        total += abs(run)
+        total += abs(since_change)
         if total < math.pi or abs(agreed) < _SHARE_AGREED * total:
             return 0
         return 1 if agreed > 0.0 else -1

@@ -117,7 +117,7 @@ class _Wheel:
         self._blocked_since: float | None = None  # it has power and does not turn; inf: counted as a stall already
 
     def update(self, sample: HallSample, now: float) -> float:
-        """Return the distance since the last sample, in mm."""
+        """Return the distance since the last sample, in mm; note whether the wheel turns, and count a stall once."""
         distance = self.hall.update(sample)
         has_turned = abs(self.hall.mm - self._turned_mm) > _NOISE_MM
         if has_turned:

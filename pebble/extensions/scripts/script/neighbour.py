@@ -73,7 +73,8 @@ class Neighbour:
                 f"{self.name} does not let {self._me} drive it: its config needs "
                 f'services.neighbours.commanded: {{"{self._me}": ["{DRIVE.metric}"]}}'
             )
-        refusal = self._own.wheels.drive_another() or self.why_refused
+        own_refusal = self._own.wheels.drive_another()  # notes the attempt; returns what prevents it there as well
+        refusal = own_refusal or self.why_refused
         if command.moves and refusal:
             return False
         # a change between moving and standing is sent at once, all else at most 50 times a second

@@ -83,7 +83,7 @@ class _Latest:
 
 
 class Robot:
-    """The robot of this script. Any thread may call every method, but no fork of the process.
+    """The robot of this script. Any thread of its process may call every method, but no forked process.
 
     Every method raises :class:`Stopped` once the script must end.
     """

@@ -126,6 +126,7 @@ class ViewerQueue:
         return len(self._queue) < limit and self._queued_bytes() + len(frame.data) <= MAX_QUEUED_BYTES
 
     def _skips_early(self, frame: Frame) -> bool:
+        """True if frames are skipped though there is room: the page is slow, and the next key frame is near."""
         return self.window < WINDOW and frame.encoding != "h264"
 
     def _begin_at(self, frame: Frame) -> None:
@@ -208,6 +209,7 @@ def assess(viewers: Collection[ViewerQueue], encoding: str, now: float, *, can_r
 
     A key frame costs all viewers and the robot's uplink. One is requested if most wait, or once for a new viewer. A
     slow viewer among fast ones gets the rescue stream instead, and so does one whose connection is thin.
+    JPEG encodings have key frames often: there a single new or slow viewer only waits for the next one.
     """
     for viewer in viewers:
         if can_rescue and not viewer.rescued and (viewer.is_thin or not viewer.decodes(encoding)):

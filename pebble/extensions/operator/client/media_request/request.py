@@ -138,7 +138,7 @@ class ViewerRequest:
         return offered({self._medium: self.section}, self._medium)
 
     def _ask(self, now: float) -> Message:
-        """Return the request, in the encoding of others if they had requested the medium: they may come back."""
+        """Return the request. It keeps the encoding of others that had requested the medium: they may come back."""
         if self._others is not None:
             self._encoding, self._others = self._others.encoding, None
         self._sent_at, self._requested = now, True
