@@ -27,7 +27,7 @@ _NOTHING = "nothing was written"
 
 
 class _Terminal:
-    """The person at this terminal."""
+    """A terminal that shows lines to a person, and reads the answers."""
 
     def tell(self, line: str) -> None:
         typer.echo(line)

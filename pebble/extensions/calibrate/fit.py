@@ -98,7 +98,7 @@ def _equations(runs: Sequence[Run], noise: Noise, wheels: NDArray[Any]) -> tuple
 
 
 def _way_noise_mm(run: Run, noise: Noise) -> float:
-    """Return the rms error of a straight run's way: of its truth, and of slipping wheels."""
+    """Return the rms error of a straight run's way: that of measuring it and that of slipping wheels."""
     return math.hypot(noise.mm, _SLIP * (run.mm or 0.0) / math.sqrt(2))
 
 

@@ -54,6 +54,7 @@ class Legs:
         self._tag_id = 0
         self._picture: Any = None
         self._odometry = Odometry(expected, clock())
+        #: Messages from the handlers' threads, with their times; :meth:`_wait` handles them on the thread that drives.
         self._inputs: queue.SimpleQueue[tuple[Callable[..., None], Any, float]] = queue.SimpleQueue()
         self._samples, self._seen_at = 0, clock()  # of the hall sensors; when the tag was last seen
         self._turned = self._heading = 0.0  # the sum of all turns, and the heading, which wraps

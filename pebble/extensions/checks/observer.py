@@ -49,11 +49,12 @@ class Observer:
         #: Returns each change of the wheels' speeds as seen from outside: when (monotonic), and left and right.
         self.eyes: Callable[[], list[tuple[float, list[float]]]] = list  # nothing is seen from outside
         self._of: defaultdict[c.Channel | None, deque[Record]] = defaultdict(lambda: deque(maxlen=_MOST))
-        self._slowest_s = ANSWER_S / 4  # of its answers
+        self._slowest_s = ANSWER_S / 4  # of its answers so far, at least this; :attr:`patience_s` follows from it
         self._arrived: deque[tuple[Message, float, float]] = deque(maxlen=_MOST)  # with the times, monotonic and epoch
+        # If the robot checks names, its commands have this client's account in their topics.
         put_account_into_topics(transport, names, lambda base: base == self.base and self.view.named)
         for filter_ in filters or (f"{self.base}/{c.OUTGOING}/#",):
-            transport.subscribe(filter_, self._take, qos=QoS.DELIVERED, direct=True)
+            transport.subscribe(filter_, self._take, qos=QoS.DELIVERED, direct=True)  # no thread: it only stores
 
     def _take(self, message: Message) -> None:
         self._arrived.append((message, time.monotonic(), time.time()))

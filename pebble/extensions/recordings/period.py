@@ -67,6 +67,7 @@ def _since(text: str, now: datetime) -> int:
 
 
 def _until(text: str, since_ns: int | None, now: datetime) -> int:
+    """Return the end of the period: an age, a date or moment, or a time of day (after ``since_ns`` if there is one)."""
     if (age := _AGE.fullmatch(text)) is not None:
         if age[1] == "-":
             return _clipped(_ns(now) - _length_ns(age))
@@ -77,6 +78,7 @@ def _until(text: str, since_ns: int | None, now: datetime) -> int:
         return _moment("--until", text, now, days=1)
     if since_ns is None:
         return _latest("--until", text, now)
+    # Without a zone if ``now`` has none: that means this machine's, whose offset may change until the moment.
     since = (_EPOCH + timedelta(microseconds=since_ns // 1000)).astimezone(now.tzinfo).replace(tzinfo=now.tzinfo)
     moment = _time_of_day("--until", text, since)
     return _ns(moment if moment > since else moment + _DAY)

@@ -38,7 +38,7 @@ class LoginAttempt:
 
     @property
     def refuses_login(self) -> bool:
-        """True if the broker refuses this user and password, or clients without; False for any other failure."""
+        """True if the broker refuses this user and password, or a login without them; False for any other failure."""
         return self.code is not None and reasons.concerns_login(self.code)
 
 
@@ -52,7 +52,7 @@ def attempt(settings: MqttSettings, *, login: bool, timeout_s: float = TIMEOUT_S
         settings = replace(settings, username=None, password=None, password_file=None)
     try:
         addresses = addresses_of(settings.host, settings.port)
-    except UnicodeError:  # a label that is too long as it travels
+    except UnicodeError:  # a part of the name is empty, or too long once it is encoded for DNS
         return LoginAttempt(problem=f"{settings.host} is no name of a host")
     except OSError as error:
         return LoginAttempt(problem=error.strerror or str(error))

@@ -54,7 +54,7 @@ def rights(trial: BrokerTrial) -> CheckResult:
     trial.wait(lambda: (mid in writer.acks and reader.received) or writer.closed)
     has_qos_1 = mid in writer.acks and bool(reader.received) and not writer.closed
     if has_qos_1:
-        trial.round_trip_s = min(1.0, time.monotonic() - began)
+        trial.round_trip_s = min(1.0, time.monotonic() - began)  # at most, as later waits last several times as long
     elif why := _why_unread(trial, reader):
         return failed(why, fix)
     trial.qos = int(has_qos_1 and granted == b"\x01")
@@ -87,10 +87,10 @@ def _retained(trial: BrokerTrial) -> Received | None:
     """Publish a message to be retained; return it as a later subscriber gets it, or None if it gets none."""
     writer, late = trial.peer(), trial.peer()
     writer.publish("retained", qos=trial.qos, retain=True)
-    writer.ping()
+    writer.ping()  # its answer: the broker has read the message
     late.subscribe("retained", qos=0)
     if not trial.wait(lambda: late.received):
-        trial.left.clear()
+        trial.left.clear()  # this broker retains nothing, so there is nothing to remove
         return None
     return late.received[0]
 

@@ -68,6 +68,8 @@ def order(trial: BrokerTrial) -> CheckResult:
     writer.ping()
     trial.wait_quiet(*readers)
     wrong = [reader for reader in readers if reader.payloads()[-1:] != [b"%d" % newest]]
+    # A last message with the retain flag was sent for the subscription, but later than newer live ones. Without the
+    # flag, the newest one is lost, or came before an older live one.
     if any(not reader.received or not reader.received[-1].retain for reader in wrong):
         return failed("the last value that comes to a new subscription is not the newest", OTHER)
     if wrong:

@@ -36,7 +36,7 @@ _MEDIA = {
     "audio_receiver": "audio_receiver",
 }
 #: Channels of these processes that no config can rename.
-_FIXED = {_LAUNCHER: STATUS, "av_daemon": MEDIA_STATUS}
+_NEVER_RENAMED = {_LAUNCHER: STATUS, "av_daemon": MEDIA_STATUS}
 
 
 def check(
@@ -221,7 +221,7 @@ def topics_of(config: Config) -> Iterator[tuple[str, list[TopicLine]]]:
 def _lines(config: Config, service: str) -> list[TopicLine]:
     """Return the topics of a service's process."""
     addresses = Addresses(config)
-    channels = [channel for channel in CHANNELS if _is_of(channel, service) or channel is _FIXED.get(service)]
+    channels = [channel for channel in CHANNELS if _is_of(channel, service) or channel is _NEVER_RENAMED.get(service)]
     if service == "serial_mcu_bridge":
         channels = [channel for channel in channels if _is_of_serial_line(channel, config)]
     lines: list[TopicLine] = []
@@ -267,16 +267,23 @@ def _uplink(config: Config) -> str:
 
 def _scripts(config: Config) -> list[tuple[str, str]]:
     """Return a warning if others may use the broker of the robot's own processes: they can pose as a script."""
-    bridge, shared = config.services.mqtt_bridge, config.transport.mqtt_mirror
-    if config.transport.kind == "mqtt":
-        shared = config.local_mqtt
-        is_zenoh_uplink = bridge.remote is not None and bridge.remote.kind != "mqtt"
-        is_elsewhere = is_zenoh_uplink or place_of(bridge.remote_mqtt) != place_of(config.local_mqtt)
-        if bridge.enabled and is_elsewhere:
-            shared = None  # operators are at the other end of the bridge
+    shared = _shared_broker(config)
     if shared is None:
         return []
     return [("scripts", f"anybody at broker {shared.host}:{shared.port} may pose as one, or end one")]
+
+
+def _shared_broker(config: Config) -> Mqtt | None:
+    """Return the broker at which the robot's own processes and others meet; None if there is none.
+
+    With Zenoh inside it is that of the mirror. With MQTT it is the local one, unless the bridge leads to another one.
+    """
+    if config.transport.kind != "mqtt":
+        return config.transport.mqtt_mirror
+    bridge = config.services.mqtt_bridge
+    is_zenoh_uplink = bridge.remote is not None and bridge.remote.kind != "mqtt"
+    is_elsewhere = is_zenoh_uplink or place_of(bridge.remote_mqtt) != place_of(config.local_mqtt)
+    return None if bridge.enabled and is_elsewhere else config.local_mqtt
 
 
 def _mqtt(mqtt: Mqtt) -> str:

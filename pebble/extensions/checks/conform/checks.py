@@ -64,7 +64,7 @@ def commanded(robot: Observer) -> str:
 
 
 def readable(robot: Observer) -> str:
-    """Return why this account cannot read requests to the robot; empty if one that changes nothing arrives."""
+    """Return why this account cannot read requests to the robot; empty if a trial one arrives, changing nothing."""
     account = (robot.account or "") if robot.view.named else ""
     is_read = robot.send_as(account, c.CONTROL, ControlRequest(id=secrets.token_hex(4), want="release"))
     return "" if is_read else "its broker does not let this account read incoming/: use an admin's"
@@ -120,6 +120,7 @@ def payloads(robot: Observer) -> CheckResult:
 
 
 def numbers(robot: Observer) -> CheckResult:
+    """Check that every payload that should be JSON is JSON, which has no NaN and no Infinity."""
     strange = set()
     for record in robot.records:
         if record.channel and record.channel.payload is not bytes and record.payload:
@@ -224,6 +225,7 @@ def junk(robot: Observer) -> CheckResult:
     robot.send(c.DRIVE, _LARGE)
     sent_at = robot.sent(ANSWER_S)
     interval_s = robot.view.liveness.interval_s or ANSWER_S
+    # Heartbeats of the first two intervals may have been sent before the robot had read all of it.
     if not robot.wait(lambda: len(robot.of(c.ONLINE, sent_at + 2 * interval_s)) >= 2, 6 * interval_s + ANSWER_S):
         return failed("its heartbeats ended", "drop what is no JSON of the contract, and go on")
     if any(beat.value and beat.value.online is False for beat in robot.of(c.ONLINE, began)):
@@ -258,7 +260,7 @@ def _counts(robot: Observer) -> dict[str, int]:
 def reset(robot: Observer, *, boot: str = "", more: int = 0) -> None:
     """Send each motor owner a reset of its present stop.
 
-    To be refused, it names another ``boot`` than the owner's, or a count that is ``more`` stops ahead.
+    An owner must refuse one with another ``boot`` than its own, or with a count that is ``more`` stops ahead.
     """
     for state in robot.view.estop.states.values():
         robot.send(c.ESTOP_RESET, EstopReset(boot=boot or state.boot, count=state.count + more, by=BY))

@@ -125,7 +125,7 @@ def at_the_wheel(robot: Observer, by: str = BY, answer_s: float = ANSWER_S) -> I
         yield driver
     finally:
         if driver.may_drive:
-            driver.send(valid_ms=0)
+            driver.send(valid_ms=0)  # a final zero: no script resumes after it
         driver.leaves()
 
 
@@ -152,7 +152,7 @@ def rested(robot: Observer, began: float, last: float, limit_s: float, what: str
         return _NOT_SHOWN
     if until == 0.0:
         return failed("its commands do not move it", "drive by incoming/drive-values, live ones")
-    if until > last + limit_s + LATE_S / 2:
+    if until > last + limit_s + LATE_S / 2:  # ``until`` is when a report arrived, a little after the motion
         shown = "still moves" if until == inf else f"moved for {until - last:.2f} s"
         return failed(f"it {shown} after {what}", f"stop {limit_s:g} s after {what}, at the latest")
     return ok(f"it rests {max(0.0, until - last):.2f} s after {what}")

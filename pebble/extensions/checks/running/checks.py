@@ -182,7 +182,7 @@ def _mcu(robot: RobotUnderTest, name: str) -> dict[str, object]:
 
 
 def battery(robot: RobotUnderTest) -> CheckResult:
-    """Report the battery's voltage; warn if it is too low for the config's number of cells."""
+    """Report the battery's voltage; fail if it stays too low for the config's number of cells."""
     robot.wait(lambda: robot.view.volts is not None, _VOLTS_S)
     volts, cells = robot.view.volts, robot.config.robot.battery_cells
     if volts is None:

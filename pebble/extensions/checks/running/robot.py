@@ -107,7 +107,7 @@ class RobotUnderTest:
 
     @property
     def own_side(self) -> RobotSide:
-        """Return the robot's own side, for a check that needs it."""
+        """Return the robot's own side. A check uses it only if that side is connected."""
         assert self.own is not None  # noqa: S101
         return self.own
 

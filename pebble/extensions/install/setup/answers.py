@@ -119,7 +119,10 @@ def read_file(file: Path) -> tuple[dict[str, Any], Secrets]:
 
 
 def combined(earlier: Answers, given: Mapping[str, Any]) -> Answers:
-    """Return the earlier answers, with given ones in their place. Raises AnswersError with a line per mistake."""
+    """Return the earlier answers, with given ones in their place. Raises AnswersError with a line per mistake.
+
+    An earlier answer that fits only the earlier broker or protocol is dropped if that changes.
+    """
     fields = asdict(earlier)
     for key, dependent in _DEPENDING.items():
         if key in given and given[key] != fields[key]:

@@ -38,7 +38,7 @@ ABOUT = "backup.json"
 NOTE = "It holds passwords and private keys: who has this file can act as this robot, its broker and its page."
 _SQLITE = b"SQLite format 3\0"
 #: Ends of names: what SQLite has beside a database, recordings, halves of files, and what a broker makes again.
-_NOT = ("-wal", "-shm", ".mcap", ".new", ".pid", ".pyc", "/mosquitto.db")
+_NEVER_SAVED = ("-wal", "-shm", ".mcap", ".new", ".pid", ".pyc", "/mosquitto.db")
 _SHA256 = "PEBBLE.sha256"  # of the content, in the header of each file but the first
 _LARGEST = 64 << 20  # bytes of one file
 _MOST = 1 << 30  # bytes of a backup
@@ -151,14 +151,14 @@ def _below(place: Path, without: Iterable[Path]) -> Iterator[Path]:
 def _add(backup: Backup, root: Path, file: Path) -> None:
     """Add a file as it is at one moment."""
     name = str(file.relative_to(root))
-    if name.endswith(_NOT):
+    if name.endswith(_NEVER_SAVED):
         return
     try:
         if (size := file.stat().st_size) > _LARGEST:
             backup.left_out[str(file)] = f"{size / 1e6:.0f} MB are too large"
             return
         content = read_plain(file)
-        if content.startswith(_SQLITE):
+        if content.startswith(_SQLITE):  # these bytes may be of several moments
             content = _database(file)
         backup.files[name] = Saved(content, file.stat().st_mode & 0o777)
     except FileNotFoundError:  # removed meanwhile

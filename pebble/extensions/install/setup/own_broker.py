@@ -23,7 +23,7 @@ def fleet_of(account: str, base: str, people: Path) -> Fleet:
 
 
 def conf_text(places: Places, fleet: Fleet) -> bytes:
-    """Return the configuration that mosquitto includes. Its paths are the robot's, without a root before them."""
+    """Return the configuration that mosquitto includes. Its paths are as programs on the robot name them."""
     return broker_files.conf_text(fleet, Path(places.named(places.broker_folder)), "").encode()
 
 

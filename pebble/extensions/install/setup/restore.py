@@ -68,7 +68,7 @@ def restore(system: System, file: Path, agree: Callable[[Sequence[str]], None]) 
                 owner, mode = _PLACES.get(_place(f"{folder.relative_to(places.root)}/"), _SHARED)
                 system.make_folder(folder, mode, owner)
         if not places.unfinished.exists() and places.etc.is_dir():
-            system.write(places.unfinished, b"")
+            system.write(places.unfinished, b"")  # no service uses the files before setup has done its steps
         if not target.exists():
             owner, _ = _PLACES[_place(name)]
             system.write(target, saved.content, saved.mode & 0o755, owner)
@@ -89,7 +89,10 @@ def _content(file: Path) -> bytes:
 
 
 def _allowed(files: dict[str, Saved], places: Places) -> dict[str, Saved]:
-    """Return the files to restore, of mosquitto's only the broker's folder: its config and links setup makes."""
+    """Return the files to restore. Of mosquitto's only the broker's folder is among them, without its links.
+
+    Those, and the configuration that mosquitto includes, are made anew, as the backup may have been changed.
+    """
     folder = f"{places.broker_folder.relative_to(places.root)}/"
     links = [f"{folder}{name}" for name in own_broker.LINKS]
     broker = str(places.broker.relative_to(places.root))
@@ -98,7 +101,7 @@ def _allowed(files: dict[str, Saved], places: Places) -> dict[str, Saved]:
         for name, saved in files.items()
         if name not in links and (name.startswith(folder) or not name.startswith("etc/mosquitto/"))
     }
-    if broker in files:
+    if broker in files:  # its text names no account, so any fleet will do
         allowed[broker] = Saved(own_broker.conf_text(places, own_broker.fleet_of("robot", "", places.people)), 0o644)
     if any(name.startswith(folder) for name in allowed) and f"{folder}{FLEET}" not in allowed:
         raise SetupError(f"the backup has files of a broker, and no {folder}{FLEET}: it was changed")

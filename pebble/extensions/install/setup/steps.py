@@ -149,6 +149,7 @@ class Job:
         if typed is not None and self.answers.broker != HERE:
             yield self._file("password of the robot at its broker", file, f"{typed}\n".encode())
         if self.answers.broker == HERE:
+            # Without a config the file is of an unfinished setup; with one, it may be of the broker before this one.
             keeps_password = self.config is None or self.has_login
             yield self._new_password("password of the robot at its own broker", file, known=keeps_password)
             if self.answers.page:

@@ -43,7 +43,7 @@ class SoundTrack:
         self._file: Any = None
         self._channels = 0
         self._written = 0  # samples
-        self._format = (0, 0)
+        self._format = (0, 0)  # rate and channels for which the resampler was made
         self._resampler: Resampler | None = None
 
     def __enter__(self) -> SoundTrack:

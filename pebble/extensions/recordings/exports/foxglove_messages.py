@@ -61,6 +61,7 @@ class Schemas:
         """Load the schemas. Raises PebbleError if they are not installed."""
         try:
             self._descriptors = importlib.import_module("google.protobuf.descriptor_pb2")
+            # One schema shows that the package is there; `make` imports each when it is needed.
             importlib.import_module("foxglove_schemas_protobuf.RawAudio_pb2")
         except ImportError as error:
             raise PebbleError(

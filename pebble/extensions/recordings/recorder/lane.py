@@ -58,10 +58,11 @@ class OpenFile:
 
     def add(self, item: Item, at_ns: int) -> None:
         """Add a message. Times never go back within a file. Raises OSError."""
-        if item.retained != CARRIED:
+        if item.retained != CARRIED:  # each new file is given the retained values anyway
             self.pending.append(item)
         self.last_ns = log_ns = max(self.last_ns, at_ns)
         stamp = stamp_ns(item.payload)
+        # A stamp that is further off is none, or of a clock that is wrong.
         publish_ns = stamp if abs(stamp - log_ns) < _DAY_NS else 0
         key = (item.topic, item.qos, item.retain, item.retained, item.source, _is_json(item.payload))
         channel = self._channels.get(key)

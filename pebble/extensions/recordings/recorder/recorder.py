@@ -120,7 +120,11 @@ class Recorder:
                 return
 
     def _turn(self, due: Due, *, stopping: bool) -> None:
-        """Write what waits, and do what is due; ``stopping``: for the last time."""
+        """Write what waits, and do what is due; ``stopping``: for the last time.
+
+        Clock and disk come first: they decide the times of the messages, and whether they can be written at all. Events
+        about them are in the queue then, and written with it.
+        """
         flushing = stopping or due.every("flush", FLUSH_S)
         if flushing:
             self._follow_clock(due)
@@ -146,4 +150,4 @@ class Recorder:
         if by_s:
             self.note("clock", by_s=round(by_s, 3), offset_before_ns=offset_ns)
             self._writing.flush()
-            self._writing.rotate(all_of_them=True)
+            self._writing.rotate(all_of_them=True)  # within a file, times never go back

@@ -31,6 +31,7 @@ class Source:
     def __init__(self, recorder: Recorder, kind: str, settings: Any, filters: Iterable[str], name: str = "") -> None:
         self._recorder, self._kind, self._name = recorder, kind, name
         self._filters = list(dict.fromkeys(filters))
+        #: The topics of a replay, which repeat what was recorded; not ignored if a filter names them.
         self._ignored = () if any(filter_.startswith(REPLAYED) for filter_ in self._filters) else (REPLAYED,)
         self._settings = settings
         self._is_modern = True  # the broker knows MQTT 5, as far as we know

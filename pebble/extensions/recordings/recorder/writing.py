@@ -224,7 +224,11 @@ class Writing:
     # -- room
 
     def check_space(self, due: Due, *, now_s: float) -> None:
-        """Look at the disk if that is due; delete files for room, and stop or resume writing."""
+        """Look at the disk if that is due; delete files for room, and stop or resume writing.
+
+        With less than ``free_bytes`` free, old files are deleted. With less than half of that, nothing is written until
+        ``free_bytes`` are free again.
+        """
         if not (due.every("space", _SPACE_S) or self._changed):
             return
         options = self._options

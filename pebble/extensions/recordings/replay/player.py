@@ -232,10 +232,10 @@ class Player:
     def _step(self) -> None:
         """Wait, send one message, or end: what is due now."""
         now, reading = self._now(), self._reading
-        if now - self._waited > _TICK_S:
+        if now - self._waited > _TICK_S:  # also if messages are due all the time, ``wait`` may pause or stop this
             self._pass(0.0)
         elif reading.state:
-            if self._send(reading.state[-1], self._pace.from_ns):
+            if self._send(reading.state[-1], self._pace.from_ns):  # the last one comes first
                 reading.state.pop()
         elif self.paused:
             self._output.halt()

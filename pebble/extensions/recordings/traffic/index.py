@@ -166,7 +166,7 @@ class _Rows:
         if activity is None:
             activity = self._declare(message.channel)
         stamp = message.publish_ns if message.publish_ns <= _LATEST_NS else 0
-        medium, online = 0, -1
+        medium, online = 0, -1  # of no media, and no heartbeat
         if payload.startswith(PBAT):
             medium = SOUND
         elif is_picture(payload):
