@@ -83,10 +83,10 @@ class Driver:
             return
         self.sent_at = now
         self.is_moving = True
-        wide = self.robot.is_wide()
+        wide = self.robot.is_wide()  # else commands are fewer, so each is valid longer, and QoS 0: none is sent again
         command = {"x": self.stick[0], "z": self.stick[1], "valid_ms": 400 if wide else 750}
         if key := self.robot.key(self.id):
-            command |= {"key": key, "t": clock_ms()}
+            command |= {"key": key, "t": clock_ms()}  # only with a key is the age of a command judged by t
         self.send("drive-values", command, 1 if wide else 0)
 
 
