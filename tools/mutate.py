@@ -214,7 +214,7 @@ class Trial:
         os.chdir(self.tree)
         sys.path = [str(self.tree), *(path for path in sys.path if path != str(ROOT))]
         os.environ |= {"PYTHONPATH": sys.path[0], "TMPDIR": str(self.tree.parent), "PYTHONDONTWRITEBYTECODE": "1"}
-        tempfile.tempdir = None
+        tempfile.tempdir = None  # so that TMPDIR is read again
         threading.settrace(self.trace)
         sys.settrace(self.trace)
         with self.options.out.open("w", buffering=1) as self.out:

@@ -58,6 +58,7 @@ class Driver:
         return ""
 
     def keep_control(self, now):
+        """Ask for control every ASKS_S, which also prolongs it; release it KEEPS_S after the stick was last pushed."""
         if now >= self.moved_at + KEEPS_S:
             if self.robot.key(self.id):
                 self.release()
