@@ -28,8 +28,8 @@ class Datagrams(Transport):
         self._socket.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, socket.inet_aton(self._group[0]) + here)
         self._socket.bind(self._group)
         threading.Thread(target=self._receive, daemon=True).start()
-        self._renew()
-        self._initial_sync(())
+        self._renew()  # of subscriptions, before the first message is offered
+        self._initial_sync(())  # sends all retained messages, as no other end stores any; the state is CONNECTED then
 
     def _close(self, will: Message | None) -> None:
         with suppress(OSError):

@@ -84,7 +84,8 @@ def mutants(file: str, text: bytes) -> Iterator[Mutant]:
             record = {"name": f"{name}:{numbers[name]}", "file": file, "line": part.lineno, "change": change}
             reached_by = {(file, line) for line in (statement, *range(part.lineno, part.end_lineno + 1))}
             yield record, reached_by, text[:start] + replacement.encode() + text[end:]
-        vars(node).update(annotation=None, returns=None, decorator_list=[])  # they are not mutated
+        # Annotations and decorators are not mutated, nor what is inside a call that logs or an f-string.
+        vars(node).update(annotation=None, returns=None, decorator_list=[])
         if not is_log and not isinstance(node, ast.JoinedStr):
             for child in ast.iter_child_nodes(node):
                 yield from walk(child, function, statement)
@@ -127,10 +128,12 @@ def replacements(node: Any) -> Iterator[tuple[str, Any, ast.AST]]:
             yield "not", node, node.operand
         case ast.Constant(value=bool() | int() | float() as value):
             yield "constant", node, ast.Constant(not value if isinstance(value, bool) else value + 1)
+        # None in place of False, 0 or "" is as false
         case ast.Return(value=ast.expr()) if not isinstance(node.value, ast.Constant) or node.value.value:
             yield "return", node.value, ast.Constant(None)
         case ast.Expr(value=ast.Call() | ast.Await()):
             yield "log" if LOG.match(ast.unparse(node)) else "call", node, ast.Pass()
+        # these tests have changes of their own, above
         case ast.If() | ast.While() | ast.IfExp() if type(node.test) not in (ast.Compare, ast.UnaryOp, ast.Constant):
             yield "if", node.test, ast.UnaryOp(ast.Not(), node.test)
 
@@ -211,7 +214,7 @@ class Trial:
         os.chdir(self.tree)
         sys.path = [str(self.tree), *(path for path in sys.path if path != str(ROOT))]
         os.environ |= {"PYTHONPATH": sys.path[0], "TMPDIR": str(self.tree.parent), "PYTHONDONTWRITEBYTECODE": "1"}
-        tempfile.tempdir = None
+        tempfile.tempdir = None  # so that TMPDIR is read again
         threading.settrace(self.trace)
         sys.settrace(self.trace)
         with self.options.out.open("w", buffering=1) as self.out:
@@ -232,10 +235,12 @@ class Trial:
         self.session, self.items = session, {item.nodeid: item for item in session.items}
         self.imported = lines_of(self.arcs)  # so far only collecting has run
         self.passed.write_text("{}")
+        # The rows run in a child, as later with each mutant: they leave nothing behind in this process.
         forked(lambda: self.passed.write_text(json.dumps(self.run_rows(list(self.items), stop=False))))
         sys.settrace(None)
         threading.settrace(None)
         self.read_rows()
+        # Find all functions by their place, so that ``swaps`` can replace their code.
         gc.unfreeze()  # get_objects leaves out what tests/conftest.py has frozen
         for function in gc.get_objects():
             if isinstance(function, FunctionType) and function.__name__ != "<lambda>":  # of which a line may have two
@@ -304,6 +309,7 @@ class Trial:
         swaps = [] if script or reached_by & self.imported else self.swaps(file, text)
         names = [name for name in self.rows if not swaps or reached_by & self.lines[name]]
         seconds = sum(self.rows[name][0] for name in names)
+        # a row may now have to set up what its module shares: at most what the module's slowest row took
         seconds += sum(self.slowest[path] for path in {self.items[name].path for name in names})
         self.failed.write_text("")
         if script:
@@ -312,7 +318,8 @@ class Trial:
         work = (lambda: self.run_swapped(swaps, names)) if in_fork else (lambda: self.run_new(file, text))
         result = "not reached"
         if names:
-            result = "survived" if forked(work, 5 * seconds + (5 if in_fork else 60)) else "killed"
+            extra_s = 5 if in_fork else 60  # a new process collects the tests again
+            result = "survived" if forked(work, 5 * seconds + extra_s) else "killed"
         (self.tree / file).write_bytes(self.texts[file])
         record |= {"rows": len(names), "killers": FAILED.findall(self.failed.read_text()), "result": result}
         record["seconds"] = round(time.monotonic() - start, 2)

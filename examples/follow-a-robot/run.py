@@ -46,18 +46,19 @@ class Companion:
         self._poses: tuple[Pose, Pose] | None = None  # of this robot and the other, at the last call
 
     def place(self, mine: Pose, its: Pose) -> Place:
+        """Return the other robot's place. ``mine`` and ``its``: the newest poses, each in its own odometry's frame."""
         my_last, its_last = self._poses or (mine, its)
         self._poses = (mine, its)
         step, turn_rad = _motion(my_last, mine)
         its_step, its_turn_rad = _motion(its_last, its)
-        self._seen += its_step * cmath.rect(1, self._turned_rad)
-        self._seen = (self._seen - step) * cmath.rect(1, -turn_rad)
+        self._seen += its_step * cmath.rect(1, self._turned_rad)  # its step, in this robot's frame
+        self._seen = (self._seen - step) * cmath.rect(1, -turn_rad)  # seen from where this robot is now
         self._turned_rad += its_turn_rad - turn_rad
-        return Place(abs(self._seen), -cmath.phase(self._seen))
+        return Place(abs(self._seen), -cmath.phase(self._seen))  # a Place's angle is positive to the right
 
 
 def _motion(before: Pose, now: Pose) -> tuple[complex, float]:
-    """Return the step in the frame of ``before``, and the turn; both 0 at a jump."""
+    """Return the step in the frame of ``before``, and the turn; both 0 if the odometry has restarted in between."""
     step = complex(now.x_m - before.x_m, now.y_m - before.y_m)
     if abs(step) > JUMP_M:
         return 0j, 0.0

@@ -58,6 +58,7 @@ class Driver:
         return ""
 
     def keep_control(self, now):
+        """Ask for control every ASKS_S, which also prolongs it; release it KEEPS_S after the stick was last pushed."""
         if now >= self.moved_at + KEEPS_S:
             if self.robot.key(self.id):
                 self.release()
@@ -83,10 +84,10 @@ class Driver:
             return
         self.sent_at = now
         self.is_moving = True
-        wide = self.robot.is_wide()
+        wide = self.robot.is_wide()  # else commands are fewer, so each is valid longer, and QoS 0: none is sent again
         command = {"x": self.stick[0], "z": self.stick[1], "valid_ms": 400 if wide else 750}
         if key := self.robot.key(self.id):
-            command |= {"key": key, "t": clock_ms()}
+            command |= {"key": key, "t": clock_ms()}  # only with a key is the age of a command judged by t
         self.send("drive-values", command, 1 if wide else 0)
 
 

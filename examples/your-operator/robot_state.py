@@ -74,7 +74,10 @@ class RobotState:
         return (self.capabilities.get("drive") or {}).get("control") is True
 
     def key(self, own_id):
-        """Return the keys of all owners that gave control to this id; "" if the first by name, who decides, did not."""
+        """Return the keys of all owners that gave control to this id, with spaces between.
+
+        The first owner by name decides: without its key the text is empty.
+        """
         keys = []
         for _, control in sorted(self.known(self.controls).items()):
             keys.append(str(control.get("key") or "") if control.get("id") == own_id else "")

@@ -95,6 +95,7 @@ class Mqtt:
             self.received_at = time.ticks_ms()
         if time.ticks_diff(time.ticks_ms(), self.received_at) > 1000 * KEEPALIVE_S:
             raise OSError("the broker is silent")
+        # After 0.4 of it, in ms: two pings are sent before silence ends the connection.
         if time.ticks_diff(time.ticks_ms(), self.pinged_at) > 400 * KEEPALIVE_S:
             self.pinged_at = time.ticks_ms()
             self.send(PINGREQ, b"")
@@ -106,5 +107,5 @@ class Mqtt:
             if first & 0xF0 == PUBLISH:
                 topic, number, payload = message(first, content)
                 if number:
-                    self.send(PUBACK, number)  # however long it is: else the broker sends no more
+                    self.send(PUBACK, number)  # also of a message that was cut: else the broker sends no more
                 yield topic, payload, bool(first & 1)

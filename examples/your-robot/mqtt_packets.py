@@ -69,7 +69,7 @@ class Reader:
         self.skipped -= gone
         self.data = self.data[gone:]
         if self.skipped == 0:
-            self.data = self.head + self.data
+            self.data = self.head + self.data  # a head is there only after a long topic, see below
             self.head = b""
         return self.skipped == 0
 

@@ -97,7 +97,7 @@ class ZenohWriter:
             return False
         slot = self._writer.slot(len(self._frame))
         fill(self._frame if slot is None else slot.array)
-        if slot is None:
+        if slot is None:  # no part of the shared memory is free now: the writer sends a copy
             self._writer.write(self._frame, self._info)
         else:
             slot.send(self._info)

@@ -127,7 +127,7 @@ def paired(ours: Samples, theirs: Samples, percent: float = 50) -> Interval:
     for our_samples, their_samples in zip(ours, theirs, strict=False):
         our_value, their_value = percentile(our_samples, percent), percentile(their_samples, percent)
         if their_value > 0 and min(our_value, their_value) < math.inf:  # false for NaN: a round without samples
-            ratios.append(min(our_value, _INFINITE) / min(their_value, _INFINITE))
+            ratios.append(min(our_value, _INFINITE) / min(their_value, _INFINITE))  # inf - inf below would be NaN
     if not ratios:
         return Interval()
     import numpy as np  # importing it earlier than it is needed would change the memory of measured processes

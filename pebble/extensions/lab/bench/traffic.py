@@ -81,7 +81,8 @@ def run(settings: Settings, console: Console) -> Shown:
         return cells_of(robots)
 
     measure_rounds(results, 1, measure, console)
-    results.complete = bool(robots)  # a robot without outages is no failure
+    # measure_rounds counts a cell without samples as incomplete; but a robot may have had no outage.
+    results.complete = bool(robots)
     results.notes += _DIFFERENCES
     return Shown(results, [media_table(robots)], figures(robots))
 

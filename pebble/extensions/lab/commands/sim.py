@@ -171,7 +171,7 @@ def _broker(broker: str, password_file: Path | None, ca_cert: Path | None) -> tu
 
     if "://" in broker or broker.startswith("zenoh:"):
         return broker_of("--broker", broker, password_file, ca_cert), None
-    config = load(Path(broker))
+    config = load(Path(broker))  # of a MiniLAMP or BenJr: its only broker is local_mqtt
     return mqtt_settings(config.local_mqtt, reconnect_max_s=LOCAL_RECONNECT_S), config
 
 

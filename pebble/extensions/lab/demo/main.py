@@ -124,7 +124,8 @@ class Demo:
         recordings = testbed.folder / "recordings"
         recordings.mkdir()
         testbed.start_recorder(recordings, *_RECORDED)
-        settings = {"cameras_in_turn": self._seconds is None, **({} if phone is None else phone.settings)}
+        has_visitors = self._seconds is None  # a timed demo has none: no camera is shown in turn
+        settings = {"cameras_in_turn": has_visitors, **({} if phone is None else phone.settings)}
         self._page_url = usual_or_free(testbed, self._ending, recordings=recordings, **settings).url
         print_line(console, f"See and drive them in a browser: {self._page_url}")
         print_line(console, f"Its Recordings show what they do, from {recordings}, which the demo deletes at its end.")
@@ -181,7 +182,7 @@ class Demo:
             self._outcomes.add(outcome_of(driven, self._testbed.robots[driven.robot].entries()))
 
     def _wrong(self, robot: SimulatedRobot) -> list[str]:
-        """Return what a robot did wrong, and with a time also what it did not do, unless a person took it."""
+        """Return what a robot did wrong. A timed demo adds what it did not do, unless a person took the robot."""
         wrong = self._outcomes.problems(robot.name)
         if self._seconds is None or robot.name in self._operator.visitors.left_alone:
             return wrong

@@ -301,8 +301,8 @@ class Operator:
             driver.stop("part of the demo")
         with closing(self._transport.subscribe(ALL_OUTGOING, receive)):  # brings retained capabilities again
             while not all(driver.stopped for driver in drivers) and time.monotonic() < pressed + _CONFIRMED_S:
-                self._hold(_FORWARD, _AGAIN_S)
-        self._hold(_FORWARD, _IN_VAIN_S)
+                self._hold(_FORWARD, _AGAIN_S)  # in vain; each command also sends the stop again when that is due
+        self._hold(_FORWARD, _IN_VAIN_S)  # after the confirmations: the motors must stay off
         reset_at = time.monotonic()
         self._complete(EMERGENCY_STOP, _FORWARD, began, pressed, reset_at)
         for driver in drivers:
@@ -325,7 +325,7 @@ class Operator:
                 self._command(robot, AutonomyCommand(action="start", file=TRAIL))
 
     def _end_trails(self) -> None:
-        """End these scripts, because an emergency stop would end them as a failure."""
+        """End the scripts that _show_trails started, because an emergency stop would end them as a failure."""
         for robot in self._robots:
             if robot.autonomy is not None and robot.autonomy.running and robot.autonomy.file == TRAIL:
                 self._command(robot, AutonomyCommand(action="stop"))

@@ -35,7 +35,8 @@ class Phone:
 
     def __init__(self, folder: Path) -> None:
         self._tls, people = folder / "tls", folder / "people.sqlite"
-        names = [*reversed(own_names()), "localhost", "127.0.0.1"]  # the first one is in the page's address
+        # The page's address has the first name: the IP address, which own_names has last, if there is one.
+        names = [*reversed(own_names()), "localhost", "127.0.0.1"]
         certificates.init(self._tls, names)
         self._password = secrets.token_hex(4)
         with closing(People(people)) as database:

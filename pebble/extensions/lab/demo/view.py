@@ -17,7 +17,7 @@ from pebble.extensions.lab.rig.robot import SimulatedRobot
 class View:
     """A view of the running robots; call ``update`` at any rate.
 
-    ``ending`` is set when the terminal was closed: under make, SIGHUP reaches only make.
+    It sets ``ending`` when it finds its terminal closed: under make, only make gets the signal SIGHUP for that.
     """
 
     def __init__(
@@ -35,7 +35,7 @@ class View:
             while self._operator.events:
                 at, line = self._operator.events.popleft()
                 self._print(at, line, "bold yellow")
-                self._step = line.removeprefix("operator ")  # the operator's activity tells it as well
+                self._step = line.removeprefix("operator ")  # as the activity has it, which is not printed again below
             now = time.monotonic()
             for robot in self._robots:
                 discovered = self._operator.discovery.robots.get(robot.base)
@@ -59,7 +59,8 @@ class View:
             yield
         except OSError:
             self._notice_closed_terminal()
-            if not self._console.quiet:
+            is_closed = self._console.quiet
+            if not is_closed:
                 raise
 
     def _notice_closed_terminal(self) -> None:

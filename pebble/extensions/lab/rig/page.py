@@ -17,7 +17,7 @@ from pebble.runtime.parent import set_up_logging
 
 def main(fields: str) -> int:
     """Serve the page until a signal ends it; return the exit code."""
-    from pebble.extensions.page.serve import run  # of packages that may be missing
+    from pebble.extensions.page.serve import run  # here, as it imports packages that may be missing
 
     def path(kind: type[Any], value: Any) -> Any:
         return Path(value) if issubclass(kind, Path) else value

@@ -72,7 +72,7 @@ class LinuxRobot(Robot):
             },
             "serial_mcu_bridge": {
                 "instances": self.instances,
-                "telemetry": {"publish_touch_sensors": self.has_scripts},
+                "telemetry": {"publish_touch_sensors": self.has_scripts},  # the script wheel-odometry reads them
             },
             "av_daemon": deep_merge(MEDIA["av_daemon"], camera),
         }
@@ -168,7 +168,10 @@ class Testbed(Processes):
         self.room_file.write_text(json.dumps(room | {"robots": _START}, indent=1))
 
     def start_brokers(self, program: str | None = None) -> None:
-        """Start the operators' remote broker and Fred's local one, see Broker. Raises PebbleError if one fails."""
+        """Start the operators' remote broker and Fred's local one, see Broker; make the robots, which use their ports.
+
+        Raises PebbleError if a broker fails.
+        """
         names = "remote-broker", "freds-broker"
         self.remote_broker, self.local_broker = (self.broker(name, program=program) for name in names)
         for broker in (self.remote_broker, self.local_broker):

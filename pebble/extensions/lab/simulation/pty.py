@@ -40,7 +40,7 @@ class _Recorder:
             self._add(ns, "line", self._received.feed(data))
 
     def sent(self, ns: int, data: bytes, *, whole: bool) -> None:
-        """Note data that was sent; ``whole``: nothing before it was lost."""
+        """Note the data that the host gets; not ``whole``: the rest of what was to be sent is lost."""
         if self._sent is not None:
             self._add(ns, "said", self._sent.feed(data))
             if not whole:

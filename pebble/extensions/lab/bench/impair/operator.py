@@ -70,7 +70,7 @@ class TrialOperator:
         self._commands: list[Command] = []
         self._heartbeats: list[Arrival] = []
         self._ready = False  # all services
-        self._over_at = time.monotonic()
+        self._over_at = time.monotonic()  # when the last trial ended; before the first, the start
 
     def open(self) -> Report:
         """Connect and wait until the robot is ready. Raises PebbleError without a broker or a robot."""
@@ -122,7 +122,7 @@ class TrialOperator:
         return closing(subscriber)
 
     def _is_fresh(self) -> bool:
-        """True if the newest heartbeats came in time, and lately: no message from before waits any more."""
+        """True if the newest heartbeats came in time, and lately: no message of the last trial waits any more."""
         newest = self._heartbeats[-_FRESH_HEARTBEATS:]
         since_ns = time.monotonic_ns() - 2 * _FRESH_MS * 1_000_000
         fresh = [heartbeat for heartbeat in newest if heartbeat.ms < _FRESH_MS and heartbeat.arrived_ns > since_ns]

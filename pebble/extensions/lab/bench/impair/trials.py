@@ -94,7 +94,8 @@ def run(settings: Settings, console: Console) -> Shown:
     ended: list[str] = []
     measure_rounds(results, 1, lambda _number, progress: measure(settings, progress, ended), console)
     results.notes += ended
-    results.complete = not ended  # in the worst trials nothing may arrive
+    # measure_rounds counts a cell without samples as incomplete; but in the worst trials nothing may arrive.
+    results.complete = not ended
     return shown(results, settings.window_s)
 
 

@@ -51,7 +51,7 @@ class FirmwareModules:
         path = place.with_suffix(".py")
         if path.is_file():
             module = self._execute(name, path)
-        elif place.is_dir() and not parent:
+        elif place.is_dir() and not parent:  # a package: our firmware has them only at the root
             module = self._add(name)
         else:
             raise ImportError(f"no module named '{name}'", name=name)

@@ -128,7 +128,7 @@ class LockstepRobot:
 
     def picture(self) -> Picture | None:
         """Return the newest picture, unless it was returned before. It is rendered only when asked for."""
-        number = int(self._now * self._camera.fps + 1e-6)
+        number = int(self._now * self._camera.fps + 1e-6)  # rounding may leave it just below a whole number
         if number == self._newest_picture:
             return None
         self._newest_picture = number

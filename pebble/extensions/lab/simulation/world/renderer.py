@@ -225,11 +225,11 @@ def _covers(plan: _Floats, layers: NDArray[np.int_], columns: _Floats) -> NDArra
     start, along = plan[:, 0], plan[:, 1] - plan[:, 0]
     normal = np.stack((along[:, 1], -along[:, 0]), axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
     normal *= np.where((start * normal).sum(axis=1, keepdims=True) > 0, -1.0, 1.0)  # towards the camera
-    # how far each edge of i is in front of the plane of j: [i, edge, j]
+    # how far each edge of i is in front of the plane of j, negative behind it: [i, edge, j]
     before = np.einsum("iek,jk->iej", plan, normal) - (start * normal).sum(axis=1)
-    nearest, farthest = before.max(axis=1), before.min(axis=1)
-    in_front = (farthest > -_TOUCHING_M) & (nearest > _TOUCHING_M)
-    behind = (nearest < _TOUCHING_M) & (farthest < -_TOUCHING_M)
+    most, least = before.max(axis=1), before.min(axis=1)  # of the two edges
+    in_front = (least > -_TOUCHING_M) & (most > _TOUCHING_M)
+    behind = (most < _TOUCHING_M) & (least < -_TOUCHING_M)
     one_plane = (np.abs(before) <= _TOUCHING_M).all(axis=1)
     may_cover = in_front | behind.T  # i is in front of the plane of j, or j is behind the plane of i
     # If each may cover the other, neither does. Within one plane the layers decide.

@@ -69,7 +69,7 @@ class HostNetwork:
         self.servers = Servers()
 
     def modules(self) -> dict[str, Any]:
-        """Return the modules for a board that has just booted."""
+        """Power off, as each boot does, and return the modules for the board."""
         self.power_off()
         return {
             "network": network_module(self.radio),
@@ -185,7 +185,8 @@ class HostTcp(BoardSocket, Stream):
         if not self._network.radio.connected:
             return None
         if not self._established and not self.ready(POLLOUT):
-            if self._network.radio.platform == "esp32":  # the ESP8266's lwIP takes early bytes, this one refuses them
+            # Before the connection is there, an ESP32 refuses data; an ESP8266 does not, but none is sent here yet.
+            if self._network.radio.platform == "esp32":
                 raise failure(errno.EINPROGRESS)
             return None
         self._established = True
