@@ -87,8 +87,8 @@ class Program(Struct, frozen=True):
     """A process: its name in logs and status, and what it runs with ``arguments``.
 
     That is a service (``module:Class``), or a module, as ``python -m`` does. The launcher imports the module before
-    it forks: importing must do nothing. What that module imports later, because only some robots need it, is in the
-    memory of those robots only.
+    it forks: importing must do nothing. Import what only some robots need in the functions that use it: then it is in
+    the memory of those robots only.
     """
 
     name: str
@@ -436,6 +436,7 @@ def _of_file(path: Path) -> Extension:
     if not path.is_file():
         raise PebbleError(f"there is no file {path}")
     if hasattr(os, "getuid") and os.getuid() == 0:
+        # Who may write in a folder may replace the file: in that of a link, and in that of the file behind it.
         folders = (path.parent, path.resolve().parent)
         uid = path.stat().st_uid or max(owner_of(folder, nameless=False).uid for folder in folders)
         if uid:

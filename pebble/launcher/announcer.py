@@ -43,7 +43,7 @@ class Announcer:
         self._reactor = Reactor()
         self._wake = WakeupPipe()
         self._stopping = False
-        self._log = RateLimitedLog(log)  # its lines are published, too
+        self._log = RateLimitedLog(log)  # a hub publishes its own lines, too: each failure could cause another
         os.set_blocking(pipe, False)
 
     def run(self, notify: Notifier, hub: ZenohHub | None = None) -> None:

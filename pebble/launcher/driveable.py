@@ -28,7 +28,7 @@ def _starts(mcu: Mcu) -> str:
 
 
 def _drives(mcu: Mcu) -> tuple[str, str]:
-    """Return the judgement of a board. A board that is silent by design looks like a dead one."""
+    """Return the judgement of a board. Silence alone is "unknown": some boards are silent by design."""
     match mcu.state:
         case "absent":
             return _NO, mcu.why or "there is no such device"

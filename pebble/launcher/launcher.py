@@ -209,9 +209,10 @@ def _check_runs_here(config: Config) -> None:
         )
     if config.path is None:
         raise ConfigError("the robot's processes know its config by its file, and this one has none")
-    without_motors = [f"{extension.key}: {extension.reason}" for extension in config.missing if extension.drives]
-    if without_motors:
-        raise ConfigError(without_motors)
+    # A robot without one of its motor owners does not start; without other extensions it starts.
+    missing_owners = [f"{extension.key}: {extension.reason}" for extension in config.missing if extension.drives]
+    if missing_owners:
+        raise ConfigError(missing_owners)
     check_connections(config)
 
 

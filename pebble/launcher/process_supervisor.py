@@ -216,7 +216,7 @@ class ProcessSupervisor:
     # -- the end of a child
 
     def _end_child(self, ending: ProgramState, *, without_child: ProgramState) -> None:
-        """Ask the child to end, and set the state ``ending``; without a child, set the other one."""
+        """Ask the child to end, and set the state ``ending``; without a child, set ``without_child``."""
         self._cancel_timer()
         if self._child is not None:
             self.state = ending

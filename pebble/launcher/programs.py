@@ -61,7 +61,7 @@ def preload(modules: Iterable[str]) -> None:
         except Exception:
             log.debug("%s cannot be imported", name, exc_info=True)
     gc.freeze()  # a collection writes into every object, and a written page is no longer shared
-    gc.enable()  # pebble.cli has disabled it: the garbage of imports is small, and finding it takes a tenth as long
+    gc.enable()  # pebble.cli has disabled it: to look for the little garbage of imports takes a tenth of their time
 
 
 def _transport_modules(config: Config) -> tuple[str, ...]:

@@ -33,13 +33,13 @@ class Reactor:
         self._read_at: float | None = None  # when the clock was last read; None while nothing runs
 
     def now(self) -> float:
-        """Return the time by this reactor's clock, in seconds; notes a stall since the last call."""
+        """Return the time by this reactor's clock, in seconds; note a stall since the last call."""
         now = self._clock()
         if self._read_at is not None:
             before, self._read_at = self._read_at, now
             passed_s = now - before
             if passed_s > _TURN_S + _STALL_S:
-                self._stood_still_s += passed_s - _TURN_S  # a turn counts: timers of a starved process run in the end
+                self._stood_still_s += passed_s - _TURN_S  # else no timer of a starved process would ever be due
                 self._on_stall(passed_s)
         return now - self._stood_still_s
 

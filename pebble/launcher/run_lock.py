@@ -36,9 +36,9 @@ class RunLock:
             require_own(self._state_path.parent)
             self._state_path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             self._state_lock = self._taken(self._state_path)
-        except (OSError, TransportError) as error:
+        except (OSError, TransportError) as error:  # no lock can be made there: that of the run directory has to do
             log.warning("a launcher with another run directory is not noticed: %s", error)
-        except PebbleError:
+        except PebbleError:  # another launcher holds it, or root must not write there
             self.release()
             raise
         self._write()

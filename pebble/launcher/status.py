@@ -61,7 +61,7 @@ class StatusPublisher:
         self._reactor.every(interval_s, self._publish_status)
 
     def changed(self) -> None:
-        """Publish the status soon, because the state of a supervisor may have changed."""
+        """Publish the status soon, as the state of a program may differ; tell systemd once the robot has started."""
         permanent = (supervisor for supervisor in self._supervisors if not supervisor.program.on_demand)
         if not self._ready_reported and all(supervisor.policy.first_attempt_done for supervisor in permanent):
             self._ready_reported = True

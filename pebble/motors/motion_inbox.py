@@ -94,6 +94,7 @@ class MotionInbox:
             return was_empty
 
     def put_request(self, request: p.ControlRequest, over: bool, now: float) -> bool:
+        """Put a request for control; ``over``: it takes control without asking the holder."""
         with self._lock:
             was_empty = self._empty
             sender = self._control.sender(request)

@@ -163,7 +163,10 @@ class MotorGuard:
             self._state.changed(now)
 
     def save_again(self) -> None:
-        """Write the file again if the last write failed, or the file was removed, unless a write is still running."""
+        """Write the file again if the last write failed or the file was removed, and once it can be written at all.
+
+        Not while a write is still running, and not in a folder that is lost, where every write fails.
+        """
         if not self._can_save and self._file.can_save():
             self._can_save = True
             self._save()

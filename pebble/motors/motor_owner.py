@@ -189,7 +189,7 @@ class MotorOwner(Service, ABC):
             self._halt()
             if only_halts:
                 self.log_limited.warning("unlatched", "a stop only halts: it could not be reset")
-                self._guard.judge(_FINAL_ZERO, self.clock())
+                self._guard.judge(_FINAL_ZERO, self.clock())  # it ends scripts, as a stop that latches does
             else:
                 self._guard.stop(stop, self.clock())
         for waiting in batch.resets:
@@ -340,7 +340,7 @@ class MotorOwner(Service, ABC):
         self._arm_guard()
 
     def _publish_state(self, state: p.EstopState) -> None:
-        """Publish the state. While a stop does not latch, remove it, repeatedly: a bridge may have missed that."""
+        """Publish the state. While a stop does not latch, clear its topic, each time: a bridge may have missed that."""
         if self._latches:
             self.publish(c.ESTOP_STATE, state, owner=self.owner)
         else:

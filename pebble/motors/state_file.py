@@ -52,7 +52,7 @@ class StateFile:
             return True
 
     def can_save(self) -> bool:
-        """True if the folder can be written or made, or is :attr:`lost`: then each write reports a failure."""
+        """True if the folder can be written or made, or if it is :attr:`lost`, so that each write reports a failure."""
         existing = next(folder for folder in self.path.parents if os.access(folder, os.F_OK))
         return self.lost or (existing.is_dir() and os.access(existing, os.W_OK | os.X_OK))
 

@@ -155,7 +155,8 @@ def hub_settings(config: Config) -> ZenohSettings:
         lease_ms=transport.lease_ms,
         journal=transport.journal,
         of_robot=True,
-        wills=tuple(  # a hub knows the rules of the contract's topics, but not the topics that this config renames
+        # A renamed topic, and True if a will on it is accepted: a hub knows the rules of the contract's topics only.
+        wills=tuple(
             dict.fromkeys(
                 (topic, channel.kind is c.Kind.FLAG)
                 for channel, topic in _renamed(config)

@@ -98,7 +98,7 @@ class Service:
     ) -> None:
         self.config, self.transport, self.instance, self.clock = config, transport, instance, clock
         self.addresses = Addresses(config)
-        transport.policy.is_stop = self.addresses[ESTOP].topic.__eq__
+        transport.policy.is_stop = self.addresses[ESTOP].topic.__eq__  # stops pass even if too many messages wait
         self.log = logging.getLogger(f"pebble.{self.name}")
         self.counters = Counters()
         self.timers = Timers()
@@ -171,7 +171,7 @@ class Service:
         return self.transport.subscribe(topic, receive, qos=QoS(channel.default_qos), direct=True)
 
     def refused(self, channel: Channel) -> bool:
-        """True if the other end refuses to deliver ``channel`` to its ``@on`` method (T21)."""
+        """True if the other end refuses to deliver ``channel`` to its ``@on`` method (T21 in docs/transports.md)."""
         return channel in self._handled and self._handled[channel].refused
 
     def post(self, job: Callable[[], None], *, newest_of: str | None = None) -> None:
@@ -322,7 +322,7 @@ class Service:
 
         if channel.newest:
             self._inbox.post(handle, newest_of=message.topic)
-        else:
+        else:  # what ends something has a name, because jobs with one are dropped last; it runs after earlier commands
             self._inbox.post(handle, last_of=message.topic if channel.ends(value) else None)
 
     def _remark(self, channel: Channel, sender: str, text: str) -> None:

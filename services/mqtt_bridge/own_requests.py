@@ -46,7 +46,7 @@ class OwnRequests:
         self._takers = {channel.suffix: requests for requests in self._requests for channel in requests.channels}
 
     def message(self, channel: Channel, payload: bytes) -> None:
-        """Handle a message that is not a flag."""
+        """Handle a message, but no flag: flags come to :meth:`flag`, once both sides agree on the value."""
         if channel is DRIVE:
             self._note_drive(payload)
         elif channel.kind is not Kind.FLAG and channel.suffix in self._takers:
@@ -55,7 +55,7 @@ class OwnRequests:
                 self._take(channel, value)
 
     def flag(self, channel: Channel, payload: bytes) -> None:
-        """Handle the value of a flag."""
+        """Handle the value of a flag on which both sides agree."""
         if channel is REMOTE_MIRROR:
             self._mirroring.switch(on=bool(payload and self._decode(channel, payload)))
         elif channel.suffix in self._takers:

@@ -110,9 +110,9 @@ class PassedStops:
                 del self._passed[next(iter(self._passed))]
             waiting = {key for key, owner in self._owners.items() if _waits(owner, name)}  # have not confirmed it yet
             reset_since = {key for key, owner in self._owners.items() if owner.freed_at > first} - waiting
-            if reset_since:
+            if reset_since:  # the stop is a repetition: for the others it was noted as pending when it came first
                 return [_addressed(stop, key) for key in self._owners if key not in reset_since]
-            for key, owner in self._owners.items():
+            for key, owner in self._owners.items():  # for each the newest stop stays pending
                 has_newer = owner.pending is not None and owner.pending.first > first
                 if key not in waiting and not has_newer and not owner.confirms(name):
                     owner.pending = Pending(stop, first, now)

@@ -34,7 +34,7 @@ class SameBrokerProbe:
         self._local, self._remote, self._clock = local, remote, clock
         self._sent: deque[bytes] = deque(maxlen=_REMEMBERED)
         self._sent_at = float("-inf")
-        self._under_way = False  # a probe that was announced: it is not known to be at the remote broker
+        self._under_way = False  # a probe was announced, and may still be on its way to the remote broker
         self._round = 0
         self._same_in_round = -1  # the newest round in which both sides were one broker
 
@@ -83,7 +83,7 @@ class SameBrokerProbe:
         self._round += 1
         if not self.send():
             return None
-        barrier(self._remote, remote_topic)  # until the remote side has the probe,
+        barrier(self._remote, remote_topic)  # until the remote side has the probe (whose topic it may forbid),
         barrier(self._local, self.topic)  # then until the local side has received what that sent
         return self._round if self.both_connected else None
 

@@ -65,19 +65,26 @@ class MqttBridge(ForwardingService):
     arriving_s = 2.0
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
+        """Make the parts of the bridge, and set the rules of its two transports."""
         super().__init__(*arguments, **options)
         section = self.config.services.mqtt_bridge
         self._heartbeat = Heartbeat(self.addresses[c.ONLINE]) if section.heartbeat.enabled else None
         self._same_broker = SameBrokerProbe(self.config, self.transport, self.remote, self.clock)
+
+        # The motor owners: are they reached, have they confirmed the stops, and who has control?
         notifier = Notifier()
         self._owners = MotorOwners(self.config.base, self.config.motor_owners, notifier)
         self._passed_stops = PassedStops(self.config.motor_owners, self.clock)
-        self._observers = Observers(self.config, self.clock)
-        deciding_owner = min(self.config.motor_owners, default="")
+        self._observers = Observers(self.config, self.clock)  # of extensions: they see what passes
+        deciding_owner = min(self.config.motor_owners, default="")  # of several, the first by name gives control
         self._control_topic = c.CONTROL_STATE.topic(self.config.base, owner=deciding_owner) if deciding_owner else ""
+
+        # Private topics, which never leave the robot: none without an extension. The forwarder refuses them in groups.
         private = next((extension.private for extension in self.config.installed if extension.private), "")
         self._private = (part(private) if private else PrivateTopics)(self.config.base)
         self.forwarder.stays = self._private.stays
+
+        # Towards operators: what is sent when, who carries out requests to the bridge, what the broker has to forget.
         self._is_thin = section.link.profile != "wide"  # or may become so
         self._uplink = uplink_of(self.config, self.addresses, self.remote, self.forwarder, self.clock)
         self._requests = OwnRequests(self, self.forwarder.mirroring, self._uplink.note_drive)
@@ -85,13 +92,20 @@ class MqttBridge(ForwardingService):
             self.config.base, self.subjects, self.remote, *self._uplink.channels, sparing=self._is_thin
         )
         self._leftover_timer: Timer | None = None
+
+        # Until when the motor owners have been sent all messages. Without pings a loss shows only as a long silence.
         sends_pings = section.remote is None or section.remote.kind == "mqtt"
         self._vouching = Vouching(self.remote, self.clock(), None if sends_pings else self._silence_s)
         self._local_changes = 0  # how often the local connection was made or lost
+
+        # Stops have a connection of their own, if there can be one.
         self._stop_topic = c.ESTOP.topic(self.config.base)
         self._stops = self._make_stops()
+
+        # Strangers can invent any number of topics, and plant retained messages: nothing is stored for these.
         self.transport.policy.is_invented = lambda topic: self.subjects.invented(topic.encode()) is not None
         self.remote.policy.skips_retained = partial(self.forwarder.skips_retained, Side.REMOTE)
+        # A retained message may come after a live one of its topic, which may be our own: the forwarder decides.
         self.remote.policy.delivers_late = True
 
     @property
@@ -208,7 +222,7 @@ class MqttBridge(ForwardingService):
             if self.forwarder.gate is Gate.SHUT:  # otherwise subscribe_remote() does that, as soon as it is called
                 self._publish_heartbeat(at_once=True)
         else:
-            barrier(self.transport, self._same_broker.topic)
+            barrier(self.transport, self._same_broker.topic)  # until the robot's retained messages have arrived
             self.forwarder.subscribed(Side.LOCAL)
             self.synchronize_later(Side.LOCAL)
         if self.forwarder.gate is not Gate.OPEN:
@@ -338,11 +352,11 @@ class MqttBridge(ForwardingService):
             self._react(Side.LOCAL, admitted, self.forwarder.receive(Side.LOCAL, admitted))
 
     def _follow_control(self, payload: bytes) -> None:
-        """Note who has control, and the present key, which decides whether a command has an age."""
-        keys = None
+        """Note who has control, and the present key: the time stamp of a command with another key is not judged."""
+        keys = None  # the motor owner gives no keys now
         with suppress(PayloadError):
             state: ControlState = codec.decode(c.CONTROL_STATE, payload)
-            keys = frozenset([state.key.encode()]) - {b""}
+            keys = frozenset([state.key.encode()]) - {b""}  # empty: no client has control
             self._observers.control(state)
         self.forwarder.ages.keys = keys
 
@@ -381,7 +395,7 @@ class MqttBridge(ForwardingService):
     def _pass_stop(self, message: Message) -> None:
         """Forward a stop of the stops' own connection.
 
-        While mirroring is on, nothing is forwarded, because the robot's own stops come back there.
+        While mirroring is on, forward none: the stops of the robot's own programs are mirrored, and come back on it.
         """
         if not self.forwarder.mirroring.on:
             self._receive_stop(message)

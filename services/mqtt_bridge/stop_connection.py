@@ -138,6 +138,7 @@ class StopConnection:
         return not is_named(message.payload) and self._copies.is_copy(Way.MAIN, message, comes_both_ways=self.listens)
 
     def check(self) -> None:
+        """Open the connection while it is wanted; give it up if it is not subscribed although the main one is there."""
         now = self._clock()
         if not self._wanted():
             self.close()

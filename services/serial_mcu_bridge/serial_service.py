@@ -120,7 +120,7 @@ class SerialService(Service, ABC):
             self._starts.began(time.monotonic())
 
     def note_clock(self, mcu_ms: int) -> None:
-        """Note the board's 32-bit clock ``mcu_ms``."""
+        """Note the board's 32-bit clock ``mcu_ms``: if it goes back, the board has started again."""
         self._starts.sent(self.line.opened, mcu_ms, time.monotonic())
 
     @every(CHECK_S)

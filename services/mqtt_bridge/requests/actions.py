@@ -56,7 +56,7 @@ class Action:
         self._ran_at: float | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._warned = False
-        self._log = RateLimitedLog(log, period_s=2.0)  # all actions together: six lines a second
+        self._log = RateLimitedLog(log, period_s=2.0)  # 3 actions with 4 subjects each: at most six lines a second
 
     @property
     def running(self) -> bool:

@@ -165,7 +165,7 @@ class DescribedBridge(SerialService):
     def _report(self, reading: Reading) -> None:
         device, now_ms = self.device, _now_ms()
         is_motion = reading.interface.profile == MOTION
-        if device is None or not device.has_motion or is_motion:
+        if device is None or not device.has_motion or is_motion:  # other readings go on if the inertial sensor fails
             self.watchdog.sample(self.clock())
         if is_motion:
             self.sensors.take(measured(reading.values), self.clock())

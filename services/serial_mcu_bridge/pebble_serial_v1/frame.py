@@ -125,6 +125,6 @@ def _full_blocks(part: bytes) -> bytes:
 
 
 def _block(part: bytes) -> bytes:
-    """Return what follows the full blocks of ``part`` as a block; it also stands for the zero behind it, if any."""
+    """Return the rest of ``part``, after its full blocks, as a block; if data follow, the block implies a zero."""
     last = part[len(part) - len(part) % _BLOCK :]
     return bytes((len(last) + 1,)) + last

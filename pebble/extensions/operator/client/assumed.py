@@ -23,7 +23,11 @@ _DRIVES = msgspec.json.encode({"subscribes": [DRIVE.suffix]})
 
 
 def assumed(base: str, axes: Collection[str], name: str = "") -> dict[str, Any]:
-    """Return the assumed capabilities: a name, and driving if there are any ``axes``."""
+    """Return the assumed capabilities: a name, and driving if there are any ``axes``.
+
+    They contain ``assumed``, and ``announced`` as well, also if they are a name only: so people are still told what
+    the board has to publish, and subscriptions that it announces later replace what was assumed.
+    """
     value = announced(base, _DRIVES) if axes else {}
     if axes:
         value["drive"]["axes"] = list(axes)
