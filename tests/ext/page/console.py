@@ -38,7 +38,7 @@ _MOVES_S = 0.7
 
 @dataclass
 class Console:
-    """``name`` is the robot's. ``held``: the keys that are down."""
+    """``name`` is the robot's. ``since_ns`` is when the last call of ``rests`` began."""
 
     tab: Tab
     stage: Stage
@@ -51,6 +51,10 @@ class Console:
     def page(self) -> Any:
         return self.tab.page
 
+    @property
+    def ref(self) -> str:
+        return self.stage.ref(self.name)
+
     def test(self, name: str) -> Locator:
         return self.tab.page.locator(f'[data-test="{name}"]:visible')
 
@@ -60,10 +64,20 @@ class Console:
         assert box is not None
         return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2, box["width"]
 
+    def uncover(self, name: str) -> Locator:
+        return self.tab.uncover(name)
+
     @property
     def reason(self) -> str:
         """The code of why it cannot be driven; "" it can."""
         return str(self.page.evaluate("window.pebble?.driver.reason()?.code ?? (window.pebble ? '' : 'loading')"))
+
+    def state(self, metric: str, ref: str | None = None) -> Any:
+        """The newest value of a metric that the page has."""
+        return self.page.evaluate(
+            "([ref, metric]) => window.pebble?.store.get(ref, metric)?.value",
+            [self.ref if ref is None else ref, metric],
+        )
 
     def because(self, *codes: str, within: float = _READY_S) -> bool:
         """Wait until driving is off for one of these reasons; "" is that it is on."""
@@ -72,7 +86,8 @@ class Console:
     def reset(self, name: str = "") -> None:
         """Without the page's controls: end the stop of this robot, or of another one."""
         ref = self.stage.ref(name or self.name)
-        self.page.evaluate("(ref) => pebble.commands.reset(ref, pebble.store.get(ref, 'web/estop').value.owners)", ref)
+        owners = self.state("web/estop", ref)["owners"]
+        self.page.evaluate("([ref, owners]) => window.pebble.commands.reset(ref, owners)", [ref, owners])
 
     def take(self) -> None:
         """Take control; there may be a stop to be reset, or a picture to wait for. Ends with nothing held."""
@@ -145,6 +160,10 @@ class Console:
         left, right = motors[-1][1] if motors else (0.0, 0.0)
         return _sign(left), _sign(right)
 
+    @property
+    def speeds(self) -> tuple[float, float]:
+        return self.stage.motors(self.name)[-1][1]
+
     def rests(self, within: float = REST_S) -> bool:
         return self.tab.until(lambda: self.wheels == REST, within)
 
@@ -188,7 +207,7 @@ def used(opened: Console, *, complaints: bool = True) -> Iterator[Console]:
     yield opened
     opened.let_go()
     opened.page.mouse.up()
-    assert opened.rests()
+    assert opened.rests(), opened.speeds
     found = opened.tab.complaints()[before:]
     assert [one for one in found if complaints or not _of_connection(one)] == []
 

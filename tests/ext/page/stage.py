@@ -8,9 +8,11 @@ from __future__ import annotations
 import threading
 import time
 from typing import Any
+from urllib.parse import urlsplit
 
 from pebble.contract.identity import Identity
 from pebble.extensions.lab.rig.testbed import ROBOTS, Testbed
+from pebble.extensions.lab.simulation.trace import Entry
 
 
 class Stage(Testbed):
@@ -34,6 +36,10 @@ class Stage(Testbed):
         self.url = self.server.url
         self.wait_until_ready()
 
+    def restart_server(self) -> None:
+        """Start it again at the same address; ends the old one if it runs."""
+        self.start_page(**{**self._settings, "port": urlsplit(self.url).port}).wait()
+
     def ref(self, name: str) -> str:
         return Identity("pebble", "robots", name).base
 
@@ -41,14 +47,27 @@ class Stage(Testbed):
         """Every change of its motors, oldest first: monotonic ns, left and right."""
         return [(entry.ns, entry.motors) for entry in self.robots[name].entries() if entry.motors is not None]
 
-    def wheels_turning(self, name: str, since_ns: int) -> bool:
-        """True if its motors run, or have run at any time since then."""
+    def motions(self, name: str) -> list[tuple[int, int]]:
+        """From when until when its motors ran at the same speeds; now if they run."""
         changes = self.motors(name)
         ends = [*(ns for ns, _ in changes[1:]), time.monotonic_ns()]
-        return any(end > since_ns for end, (_, speeds) in zip(ends, changes, strict=False) if any(speeds))
+        return [(ns, end) for (ns, speeds), end in zip(changes, ends, strict=False) if any(speeds)]
+
+    def wheels_turning(self, name: str, since_ns: int | None = None) -> bool:
+        """Whether its motors run now; with ``since_ns`` whether they have run at any time since then."""
+        since_ns = time.monotonic_ns() if since_ns is None else since_ns
+        return self.last_motion_ns(name) > since_ns
+
+    def last_motion_ns(self, name: str) -> int:
+        """When its motors were last switched off; now if they run, 0 if they have never run."""
+        return max((end for _, end in self.motions(name)), default=0)
 
     def restart_broker(self) -> None:
         """Start the operators' broker again at the same port, without its retained messages. Raises PebbleError."""
         self.end(self.remote_broker)
         self.remote_broker = self.broker("remote-broker", port=self.broker_port)
         self.remote_broker.wait()
+
+    def lines(self, name: str) -> list[Entry]:
+        """What its MCU received, oldest first."""
+        return [entry for entry in self.robots[name].entries() if entry.event == "line"]
