@@ -28,6 +28,7 @@ def written(folder: Path, name: str, **settings: Any) -> Path:
         ({"id": "a/b"}, "gate.json: id: must be a topic level"),
         ({"id": "g", "hub": {}}, "gate.json: hub.connect: is missing: write where the hub listens"),
         ({"id": "g", "mqtt": {"hosts": ["a", "b"]}}, "gate.json: mqtt: hosts is no key any more"),
+        ({"id": "g", "robots": []}, "gate.json: robots: is empty"),
         ({"id": "g", "robots": ["pebble/gateways/+"]}, "'pebble/gateways/+' is no base"),
         ({"id": "g", "boards": {}}, "gate.json: boards: must be left out beside hub"),
         ({"id": "g", "hub": {}, "boards": {"host": "localhost"}}, "gate.json: mqtt: is also boards"),
