@@ -115,7 +115,7 @@ class LevelControl:
 
     def poll(self, age_s: float, now: float) -> bool:
         """Note that the oldest packet has waited for ``age_s``; True if the level changes."""
-        if now - self._polled_at > _GAP_S:
+        if now - self._polled_at > _GAP_S:  # what was measured before says nothing about now
             self._slow_since = self._fast_since = None
         self._polled_at = now
         self._slow_since = _since(self._slow_since, age_s > _SLOW_S, now)
@@ -126,6 +126,7 @@ class LevelControl:
         if now - self._changed_at < _PAUSE_S:
             return False
         if self._slow_since is not None and now - self._slow_since >= _PATIENCE_S and self.level < self._last:
+            # Before the first fall _FIRST_CALM_S was enough; from now on it takes _CALM_S, longer after failed rises.
             last_rise_failed = now - self._raised_at < 2 * self._calm_s
             longer_s = 2 * self._calm_s if last_rise_failed else self._calm_s
             self._calm_s = min(max(_CALM_S, longer_s), _CALMEST_S)
@@ -140,8 +141,8 @@ class LevelControl:
         return True
 
 
-def _since(before: float | None, is_so: bool, now: float) -> float | None:
-    """Return since when something is so, if it was so since ``before``; None if it is not so now."""
-    if not is_so:
+def _since(before: float | None, holds: bool, now: float) -> float | None:
+    """Return since when a condition holds; None if it does not. ``before``: the result of the last call."""
+    if not holds:
         return None
     return now if before is None else before

@@ -59,7 +59,7 @@ class AudioPublisher(Service):
         self._reader.open()
         self._thread.start()
         self.on_stop(lambda: self._thread.join(_END_S))
-        self.on_stop(self._reader.close)
+        self.on_stop(self._reader.close)  # it is called before join, as it was added later: it ends the thread
 
     def stop(self) -> None:
         self._stopping = True

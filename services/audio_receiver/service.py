@@ -50,6 +50,7 @@ class AudioReceiver(Service):
         self._remote.open(timeout=0.0)
         self.on_stop(self._remote.close)
         address, security = self.addresses[AUDIO_STREAM], self.config.security
+        # At the level named: senders with a name, and others only if strangers are not refused.
         topics = [with_name(address.topic, "+")] if security.named else []
         if not security.named or security.unnamed != "refuse":
             topics.append(address.topic)

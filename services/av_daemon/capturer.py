@@ -24,7 +24,8 @@ _POLL_S = 0.1  # how soon the first reader is noticed
 class Capturer:
     """A thread that captures until :meth:`end`, which does not wait, because a device can hang.
 
-    After :meth:`end` it neither writes nor reports, even if its device answers at last.
+    After :meth:`end` it neither writes nor reports, even if its device answers at last. ``wait_s``: before it opens the
+    device for the first time; ``rest_s``: without a reader, before it closes the device.
     """
 
     def __init__(
@@ -142,7 +143,7 @@ def _as_it_is(info: FrameInfo, data: Bytes) -> FrameInfo:
 
 
 def _content(info: FrameInfo, data: Bytes) -> int | str:
-    """Return a checksum of the frame's bytes.
+    """Return a checksum of the frame's bytes; NOTHING for sound that is all zeros, as of a muted microphone.
 
     Of a large frame only some bytes are read, because in a camera's frames all bytes change.
     """

@@ -60,7 +60,7 @@ class Health:
     def frame(self, info: FrameInfo, now: float, *, skipped: int = 0, content: int | str | None = None) -> None:
         """Note a frame. ``content`` differs between frames with different bytes; None: it was not computed."""
         self._dropped += skipped
-        if content is not None or self._info is None:  # nobody reads the others: what is in them is unknown
+        if content is not None or self._info is None:  # without content the size in a JPEG was not read
             self._info = info
         if content is not None:
             self._check.take(content, now)
@@ -75,7 +75,7 @@ class Health:
         """Note a failure; return the seconds until the next try: the first delay if the failure was ``expected``."""
         doublings = 0 if expected else self._failures
         delay: float = min(self._first_delay_s * 2**doublings, max(_LONGEST_DELAY_S, self._first_delay_s))
-        self._failures = min(doublings + 1, 32)
+        self._failures = min(doublings + 1, 32)  # more than enough for the longest delay
         self._last_error = why
         self._no_frames(f"failed, opens it again in {delay:g} s")
         return delay

@@ -66,7 +66,7 @@ class SendWindow:
         frames, slack_s = self._frames.acknowledge(waiting), self._slack_s(now)
         acknowledged = []
         for frame in frames:
-            began = max(frame.at + round_trip_s, self._free_at)
+            began = max(frame.at + round_trip_s, self._free_at)  # what it took before was the path, or another frame
             self._free_at = now
             is_prompt = now - frame.at - round_trip_s <= _PROMPT_S
             self._limit = max(1, min(_MOST, self._limit + (1 if is_prompt else -1)))

@@ -24,7 +24,7 @@ def _check(reader: Reader, root: Root, _: Place) -> Root:
     """Note a problem if there is no broker that Home Assistant could use."""
     section: HomeAssistant = root.services.homeassistant  # type: ignore[attr-defined]  # of this extension
     bridge = root.services.mqtt_bridge
-    if section.enabled and not (bridge.enabled and bridge.remote is None):
+    if section.enabled and not (bridge.enabled and bridge.remote is None):  # ``remote``: by Zenoh, not by MQTT
         why = "is not used without a remote broker by MQTT: enable services.mqtt_bridge with remote_mqtt"
         reader.notes.warning((*_PLACE, "enabled"), why)
     return root

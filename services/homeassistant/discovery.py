@@ -19,7 +19,7 @@ from pebble.version import __version__
 MAX_BYTES, MAX_COMPONENTS = 8000, 24  # of the message, and of what is in it; the last owners are left out
 ACCOUNT: Final = "homeassistant"  # of Home Assistant at a broker that vouches for names
 _STALE_S: Final = 600  # after it, volts are not shown
-_ONLINE: Final = "value_json.online is defined and not value_json.online"
+_OFFLINE: Final = "value_json.online is defined and not value_json.online"
 _STOP: Final = """{"stop": "{{ '%016x' | format((now().timestamp() * 1000000) | int) }}", "by": "homeassistant"}"""
 _COLOUR: Final = (
     '{"r": {{ (red | default(255)) / 255 }}, "g": {{ (green | default(255)) / 255 }}, '
@@ -45,11 +45,11 @@ def discovery(base: str, capabilities: dict[str, Any], expose: Collection[str] =
     """Return the message. ``unit``: the unit of the battery's level, ``v`` or ``%``; "" if unknown."""
     name, identity = object_id(base), section_of(capabilities, "identity")
     online = c.ONLINE.topic(base)
-    availability = {"avty_t": online, "avty_tpl": f"{{{{ 'offline' if {_ONLINE} else 'online' }}}}"}
+    availability = {"avty_t": online, "avty_tpl": f"{{{{ 'offline' if {_OFFLINE} else 'online' }}}}"}
     components: dict[str, Component] = {}
     # Without availability: an absent tracker would be unavailable, not away.
     presence = {"p": "device_tracker", "name": "Presence", "stat_t": online, "src_type": "router"}
-    components["presence"] = presence | {"val_tpl": f"{{{{ 'not_home' if {_ONLINE} else 'home' }}}}"}
+    components["presence"] = presence | {"val_tpl": f"{{{{ 'not_home' if {_OFFLINE} else 'home' }}}}"}
     components |= {key: value | availability for key, value in _components(base, capabilities, expose, unit)}
     for key, component in components.items():
         component["uniq_id"] = f"{name}_{key}"
@@ -65,7 +65,7 @@ def discovery(base: str, capabilities: dict[str, Any], expose: Collection[str] =
         "cmps": components,
     }
     while len(components) > MAX_COMPONENTS or len(msgspec.json.encode(message)) > MAX_BYTES:
-        components.popitem()
+        components.popitem()  # from the end, where the states of owners are
     return msgspec.json.encode(message)
 
 
@@ -91,7 +91,7 @@ def _components(
         yield "charging", _binary("Charging", "battery_charging", topic(c.CHARGING_STATUS), "value")
     if video.get("encoding") == "jpeg":  # Home Assistant shows no other
         yield "camera", {"p": "camera", "name": "Camera", "t": topic(c.CAMERA)}
-    if video.get("controls") is True:
+    if video.get("controls") is True:  # not retained below a name: the bridge would drop it
         flag = {"p": "switch", "name": "Video", "stat_t": topic(c.MQTT_VIDEO), "val_tpl": _FLAG}
         yield "video", flag | {"pl_on": "true", "pl_off": "false"} | command(topic(c.MQTT_VIDEO)) | {"ret": not named}
     if section_of(capabilities, "lights").get("solid") is True:

@@ -163,7 +163,7 @@ class CmdVel:
             self._save(owed)
 
     def _first_lock(self) -> bytes | None:
-        """Return the first message for a new subscriber of the lock, if any; called on the thread of sockets."""
+        """Return the lock's state for a new subscriber; None if it was never set. Called on the thread of sockets."""
         if not self._has_set_lock:
             return None
         if not self._latched:

@@ -52,8 +52,8 @@ class Node:
     """A node of ROS 1. Call :meth:`advertise` and :meth:`subscribe`, then :meth:`start`.
 
     One thread has the sockets, one serves the API of the node, one calls the master and publishers, one calls
-    subscribers that were lost: none of them waits for another, and no message for a call. ``on_evicted(why)`` is
-    called, on some thread, when another node has the name: nothing may move from then on.
+    subscribers that were lost. None of them waits for another, so a call that takes long delays no message.
+    ``on_evicted(why)`` is called, on some thread, when another node has the name: nothing may move from then on.
     """
 
     def __init__(self, name: str, master: str, host: str, on_evicted: Callable[[str], object]) -> None:
@@ -228,9 +228,9 @@ class Node:
             return ""
 
     def _revive(self, publishers: Mapping[str, list[str]], subscribers: Mapping[str, list[str]]) -> None:
-        """Have subscribers that the master lists, but are not connected, told of this node every REVIVE_S.
+        """Find lost subscribers: those that the master lists, and that are not connected. Queue them to be told again.
 
-        By themselves they would wait for minutes after the network was cut.
+        Each is told of this node every REVIVE_S: by itself it would wait for minutes after the network was cut.
         """
         now = time.monotonic()
         missing: dict[tuple[str, str], float] = {}

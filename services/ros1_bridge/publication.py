@@ -56,7 +56,7 @@ class Publication:
 
     def __init__(self, topic: str, form: Form, definition: str, close: Callable[[socket.socket], None]) -> None:
         self.topic, self.form, self.definition = topic, form, definition
-        #: What a new subscriber gets at once; None: nothing.
+        #: Returns the message that a new subscriber gets at once, made at that moment; None: it gets none.
         self.first: Callable[[], bytes | None] = lambda: None
         self.dropped = 0
         self._close = close
@@ -76,15 +76,15 @@ class Publication:
             return sum([self._send(subscriber, data) for subscriber in list(self._subscribers)])
 
     def add(self, subscriber: Subscriber) -> bool:
-        """Add a subscriber that was answered, and send it the first message; False if there are too many."""
+        """Add a subscriber whose request was answered; send it what `first` returns. False if there are too many."""
         with self._lock:
             if len(self._subscribers) >= MOST_PEERS:
                 return False
             subscriber.publication = self
             self._subscribers.append(subscriber)
-            first = self.first()
-            if first is not None:
-                self._send(subscriber, block(first))
+            body = self.first()
+            if body is not None:
+                self._send(subscriber, block(body))
         log.info("%s: %s subscribes", self.topic, subscriber.name)
         return True
 

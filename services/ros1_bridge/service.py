@@ -71,7 +71,7 @@ class Ros1Reader(Service):
 
 
 class Ros1Bridge(Ros1Reader, MotorOwner):
-    """A service that also drives the base. A stop locks its multiplexer: at zeros alone others drive a Husky on."""
+    """A service that also drives the base. A stop locks the base's multiplexer, so that no ROS program moves it."""
 
     name = "ros1_bridge"
     publishes = (*MotorOwner.publishes, *PUBLISHES)
@@ -89,7 +89,7 @@ class Ros1Bridge(Ros1Reader, MotorOwner):
             ros.cmd_vel_publish_interval_seconds,
             None if ros.estop_topic == NONE else ros.estop_topic,
             None if ros.cancel_topic == NONE else ros.cancel_topic,
-            owed=self._lock_file.load() not in (None, False),
+            owed=self._lock_file.load() not in (None, False),  # a file that cannot be read counts as a lock
             save=self._lock_file.save,
         )
 
@@ -100,7 +100,7 @@ class Ros1Bridge(Ros1Reader, MotorOwner):
     def start(self) -> None:
         """Start in the saved state: a stopped base is locked before it can receive a command."""
         self.on_stop(self._lock_file.close)
-        MotorOwner.start(self)
+        MotorOwner.start(self)  # not that of Ros1Reader, which would start the node at once
         self.cmd_vel.latch(self.latched)
         self.node.start()
         self.on_stop(self.node.close)

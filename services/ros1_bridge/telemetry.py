@@ -214,7 +214,7 @@ def _place(position: messages.Numbers, yaw: float) -> dict[str, float]:
 
 
 def _items(parts: list[Health], most: int) -> list[dict[str, Any]]:
-    """Return the diagnostics to publish: healthy parts only while there is room."""
+    """Return the first ``most`` diagnostics. As in the original, an unhealthy part after these is left out."""
     chosen: list[Health] = []
     for part in parts:
         if part.level > 0 or len(chosen) < most:

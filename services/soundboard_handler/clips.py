@@ -69,7 +69,7 @@ class Clips:
         if not is_clip:
             return None
         inside = path.relative_to(root).as_posix()
-        return Clip(inside if is_text(inside) else name, path)  # a link may have a name that can be published
+        return Clip(inside if is_text(inside) else name, path)  # else the name of a link to it
 
     def _files(self, root: Path) -> Iterator[str]:
         def failed(error: OSError) -> None:

@@ -92,7 +92,7 @@ class SoundboardHandler(Service):
             self._error = "Play command missing file"
             return None
         clip = self._clips.find(name) or self._clips.find(name.strip())
-        if clip is None and not name.isascii():
+        if clip is None and not name.isascii():  # an é may be one character or two: find what looks the same
             clip = self._clips.find(meant(self._clips.scan(), name.strip()))
         if clip is None:
             self._error = f"Sound file not found: {name[:_LONGEST_NAME]}"

@@ -117,7 +117,7 @@ class JitterBuffer:
         except PayloadError:
             self.counters.add("refused")
             return
-        number = (sound.sequence - 1) % _NUMBERS + 1
+        number = (sound.sequence - 1) % _NUMBERS + 1  # 0, which is not used, counts as the number before 1
         if self._is_old(number, sound.captured_ms):
             self.counters.add("late")
             return
@@ -207,7 +207,7 @@ class JitterBuffer:
             self.counters.add("jumps")
         elif missing:
             self.counters.add("lost", missing)
-        elif self._concealed and self._last is not None:
+        elif self._concealed and self._last is not None:  # the packet came late: estimated sound took its time
             self._depth.late(self._concealed / self._last.rate, now)
         return self._play(number, now)
 
@@ -219,6 +219,7 @@ class JitterBuffer:
         if received is None:
             return self._conceal(self._budget_s)
         samples = received.samples
+        # Opus decodes on from its own estimate; that of pcm repeats the last packet, and ends anywhere in it.
         if self._concealed and self._last is not None and received.encoding == "pcm":
             samples = _faded_in(samples, received.rate)
         self._last, self._concealed, self._spare = received, 0, None

@@ -52,20 +52,20 @@ class Resampler:
         self._taps = 2 * ceil(_CROSSINGS * widened)
         self._filter = _filter(min(self._up, _PHASES), self._taps, _PASS / widened)
         self._tail = np.zeros((self._taps - 1, channels), np.float32)
-        self._at = 0  # position of the next output sample, from the begin of the tail; unit: an input sample / _up
+        self._at = 0  # position of the next output sample, from the beginning of the tail; unit: an input sample / _up
 
     def feed(self, samples: Samples) -> Samples:
         if self._up == self._down:
             return samples
         fed = np.concatenate((self._tail, samples.astype(np.float32)))
-        windows = len(fed) - self._taps + 1
+        windows = len(fed) - self._taps + 1  # positions of the filter in ``fed``, one input sample apart
         count = max(0, ceil((windows * self._up - self._at) / self._down))
         # In units of 1/_up input sample: the whole input samples choose the window, the rest the phase of the filter.
         positions = self._at + self._down * np.arange(count, dtype=np.int64)
         phases = positions % self._up * len(self._filter) // self._up
         views = np.lib.stride_tricks.sliding_window_view(fed, self._taps, axis=0)[positions // self._up]
         mixed = np.einsum("nck,nk->nc", views, self._filter[phases], optimize=False)
-        self._at += self._down * count - windows * self._up
+        self._at += self._down * count - windows * self._up  # now from the beginning of the new tail
         self._tail = fed[windows:]
         return to_int16(mixed)
 

@@ -66,11 +66,11 @@ class Robot:
         """Handle a message that arrived at ``now`` (monotonic) and ``wall`` (epoch seconds)."""
         self.view.receive(channel, message, now, wall)
         self.heard_at = self.view.liveness.received_at or self.heard_at
-        self._meter.add(now, 0 if message.retain else len(message.payload))
+        self._meter.add(now, 0 if message.retain else len(message.payload))  # the robot sent a retained one earlier
         with suppress(PayloadError, msgspec.ValidationError):
             if channel is c.CHARGING_LEVEL:
                 level = codec.decode(channel, message.payload)
-                unit = codec.plain(channel, message.payload).get("unit")  # the decoded level has volts in place of none
+                unit = codec.plain(channel, message.payload).get("unit")  # a decoded level without a unit has volts
                 self._battery = (_BATTERY[unit], level.value) if unit in _BATTERY else None
             elif channel is c.STATUS:
                 services = codec.decode(channel, message.payload).value.get("services")
@@ -86,7 +86,7 @@ class Robot:
         for name in media.keys() & before.keys():
             dropped = (media[name].dropped or 0) - (before[name].dropped or 0)
             handled = dropped + (media[name].rate or 0.0) * seconds
-            if dropped >= 0 and handled > 0:
+            if dropped >= 0 and handled > 0:  # less than 0: the program was restarted, and counts anew
                 self._loss[name] = dropped / handled
 
     def add_to(self, samples: Samples, now: float) -> None:
@@ -111,7 +111,7 @@ class Robot:
                 samples.add("pebble_service_up", service.state == "ready", robot=robot, service=name)
             samples.add("pebble_service_restarts_total", service.restarts, robot=robot, service=name)
         media = {name: report for name, report in self._media.items() if report.running}
-        sent = sum(report.bitrate or 0 for report in media.values())
+        sent = sum(report.bitrate or 0 for report in media.values())  # the meter has no pictures, and no sound
         samples.add("pebble_link_bytes_per_second", (self._meter.bitrate(now) + sent) / 8, robot=robot)
         for name, report in media.items():
             samples.add("pebble_media_fps", report.rate, robot=robot, stream=name)

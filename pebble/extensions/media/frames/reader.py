@@ -70,8 +70,9 @@ class FrameReader:
         prepare_run_dir(self._names.folder)
         with self._changing:
             self._latest.reopen()
-            lockable = not self._sharing or shared_memory.lockable(2 * METADATA)
-            self.problem = "" if lockable else self._memlock_problem(2 * METADATA)
+            needed = 2 * METADATA  # the reader's own, and that of a writer, which is mapped as well
+            lockable = not self._sharing or shared_memory.lockable(needed)
+            self.problem = "" if lockable else self._memlock_problem(needed)
             self._start()
         close_at_exit(self)
         return self

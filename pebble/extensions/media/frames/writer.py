@@ -76,7 +76,7 @@ class FrameWriter:
         prepare_run_dir(self._names.folder)
         self._sweep()
         self.problem = self._why_not_shared()
-        self._writer_id = random.SystemRandom().getrandbits(63) | 1
+        self._writer_id = random.SystemRandom().getrandbits(63) | 1  # never 0, which is no writer
         self._sequence = 0
         session = self._session = self._open_session()
         self._pid = os.getpid()
@@ -109,7 +109,7 @@ class FrameWriter:
 
     @property
     def may_share(self) -> bool:
-        """True if shared memory has room now, and had none when this writer was opened."""
+        """True if shared memory had no room when this writer was opened, and now has: another writer could share."""
         return time.monotonic() >= self._retry_at and self._has_room()
 
     def _has_room(self) -> bool:
