@@ -214,14 +214,11 @@ def _place(position: messages.Numbers, yaw: float) -> dict[str, float]:
 
 
 def _items(parts: list[Health], most: int) -> list[dict[str, Any]]:
-    """Return the first ``most`` diagnostics. As in the original, an unhealthy part after these is left out."""
-    chosen: list[Health] = []
-    for part in parts:
-        if part.level > 0 or len(chosen) < most:
-            chosen.append(part)
+    """Return at most ``most`` diagnostics, the unhealthy ones first. (The original cuts off those behind ``most``.)"""
+    unhealthy_first = sorted(parts, key=lambda part: part.level == 0)
     return [
         {"name": part.name, "level": part.level, "label": _label(_LEVELS, part.level), "message": part.message}
-        for part in chosen[:most]
+        for part in unhealthy_first[:most]
     ]
 
 

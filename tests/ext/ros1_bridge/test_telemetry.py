@@ -141,7 +141,7 @@ def test_diagnostics_tell_the_unhealthy_and_the_battery() -> None:
     parts = [(0, "a", {}), (0, "b", {}), (0, "power", {"Charge (%)": "87.5"}), (2, "dock", {"on": " Charging "})]
     heard.topics["/diagnostics_agg"](diagnostics(*parts))
     value = heard.published["diagnostics"]["value"]
-    assert (value["level"], value["label"], [item["name"] for item in value["items"]]) == (2, "ERROR", ["a", "b"])
+    assert (value["level"], value["label"], [item["name"] for item in value["items"]]) == (2, "ERROR", ["dock", "a"])
     assert heard.published["charging-level"] == STAMP | {"value": 87.5, "unit": "%"}
     assert heard.published["charging-status"] == STAMP | {"value": True}
     heard = Heard()
