@@ -10,6 +10,8 @@ from pebble.contract import DRIVE as DRIVE_CHANNEL
 from pebble.contract import LIGHTS_SOLID, MCU_COMMAND, OUTLET_COMMAND, codec, groups
 from pebble.errors import ConfigError, PayloadError
 from pebble.extensions.thin.group_gate import copy_of, is_marked
+from pebble.forwarding.forwarder import Forwarder
+from pebble.forwarding.routing import Drop, Forward
 from pebble.launcher.capabilities import capabilities
 from pebble.runtime.addresses import Addresses
 from tests.forwarding.virtual import World
@@ -58,6 +60,19 @@ def test_a_group_passes_whole_and_then_as_copies(start: Start, profile: str) -> 
     assert arrived(world) == [("group", {"drive-values": {"z": 0.5}, "lights-solid": {"r": 1}}), *COPIES]
 
 
+def test_a_bridge_that_ends_behind_the_group_leaves_it_whole(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    world, deliver = start(), Forwarder.deliver
+
+    def deliver_once(*arguments: Any) -> Forward | Drop:
+        monkeypatch.setattr(Forwarder, "deliver", lambda *_: Drop.NO_ROOM)
+        return deliver(*arguments)
+
+    monkeypatch.setattr(Forwarder, "deliver", deliver_once)
+    world.remote.publish(GROUP, BOTH)
+    world.run(0.1)
+    assert arrived(world) == [("group", {"drive-values": {"z": 0.5}, "lights-solid": {"r": 1}})]
+
+
 def test_without_the_key_a_group_is_a_command_like_any_unknown_one(start: Start) -> None:
     world = start(on=False)
     world.remote.publish(GROUP, BOTH)
@@ -68,6 +83,7 @@ def test_without_the_key_a_group_is_a_command_like_any_unknown_one(start: Start)
 @pytest.mark.parametrize(
     ("payload", "late_s", "passes"),
     [
+        (b'{"drive-values": {"z": 0.5}, "estop": {}}', 0.0, []),
         (b'{"drive-values": {"z": 0.1}, "\\u0064rive-values": {"z": 0.9}}', 0.0, []),
         (BOTH, 0.6, []),
         (ZERO, 0.6, ["group", "drive-values", "lights-solid"]),
@@ -94,6 +110,14 @@ def test_a_scripts_zero_passes_as_a_persons(start: Start) -> None:
     world.run(0.1)
     assert all("run" not in payload for _, payload in arrived(world))
     assert len(arrived(world)) == 3
+
+
+def test_a_retained_group_is_stale(start: Start) -> None:
+    world = start()
+    world.remote.publish(GROUP, BOTH, retain=True)
+    world.run(0.1)
+    assert arrived(world) == []
+    assert world.service.status.counts[f"remote: {Drop.STALE.value}"] == 1
 
 
 @pytest.mark.parametrize(
