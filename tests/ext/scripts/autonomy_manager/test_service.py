@@ -77,24 +77,6 @@ def test_it_begins_idle_and_stops_what_a_predecessor_may_have_left(bench: Bench)
 
 
 @pytest.mark.parametrize(
-    "body",
-    [
-        {"action": "RUN ", "file": " walk "},
-        {"value": {"enabled": True, "file": "walk"}},
-        {"value": True, "file": "walk"},
-    ],
-)
-def test_a_start_has_many_forms_and_so_has_a_stop(bench: Bench, body: dict[str, Any]) -> None:
-    bench.command(body)
-    assert bench.becomes(running=True, config={"speed": 0.5})
-    (walk,) = bench.children.all
-    bench.command({"action": "disable"})
-    assert until(lambda: walk.signals == [TERM])
-    walk.end(-TERM)
-    assert bench.becomes(**IDLE)
-
-
-@pytest.mark.parametrize(
     ("body", "error"),
     [
         (True, "Start command missing file"),
