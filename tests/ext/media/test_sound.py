@@ -23,6 +23,7 @@ from pebble.extensions.media.sound import (
     ReceivedSound,
     SoundDecoder,
     make_sound_encoder,
+    sequence_numbers,
     unpack,
 )
 from pebble.extensions.media.sound_file import SoundFile
@@ -137,6 +138,21 @@ def test_bitrate_is_as_configured() -> None:
     }
     assert sizes[16000] * 8 / SECONDS < 18_000
     assert sizes[16000] < sizes[32000] * 8 / 8 < 36_000 / 8 * SECONDS
+
+
+def test_any_change_in_midstream() -> None:
+    numbers = sequence_numbers()
+    made = []
+    for name, rate, channels in (("pcm", 16000, 1), ("opus", 16000, 1), ("opus", 48000, 2), ("pcm", 44100, 2)):
+        made += packets(name, speech(rate, channels)[: rate // 5], rate, feed=rate // 50, numbers=numbers)
+    sounds = received(made)
+    assert [one.sequence for one in sounds] == list(range(1, 41))
+    assert [(one.encoding, one.rate, one.channels) for one in sounds[::10]] == [
+        ("pcm", 16000, 1),
+        ("opus", 16000, 1),
+        ("opus", 48000, 2),
+        ("pcm", 44100, 2),
+    ]
 
 
 @pytest.mark.parametrize(

@@ -219,13 +219,6 @@ def test_what_goes_wrong_with_a_player_is_reported_and_not_repeated(board: Sound
     assert board.became(playing=True, file="good.wav", error=None), "the next command clears the error"
 
 
-def test_a_player_that_is_missing_is_reported(make: Make) -> None:
-    board = make(player_command=["no-such-player"], clip=0.1)
-    board.play("a.wav")
-    error = "Failed to start playback: [Errno 2] No such file or directory: 'no-such-player'"
-    assert board.became(playing=False, error=error)
-
-
 def test_the_list_follows_the_folder_and_an_unchanged_one_is_not_published_again(board: Soundboard) -> None:
     now, published = [0.0], list[Any]()
     service = SoundboardHandler(board.config, board.world.transport, clock=lambda: now[0])

@@ -226,6 +226,23 @@ def test_a_fork_of_a_writer_or_reader_may_not_use_it(tmp_path: Path) -> None:
 
 
 @needs_shared_memory
+def test_both_can_be_opened_again(tmp_path: Path) -> None:
+    writer, reader = FrameWriter(tmp_path, "camera", capacity=50_000), FrameReader(tmp_path, "camera")
+    for number in (1, 2, 3):
+        with writer, reader:
+            assert until(lambda: writer.wanted)
+            assert writer.write(b"x" * 50_000, FrameInfo())
+            frame = reader.read(5)
+            assert frame is not None
+            assert (frame.info.sequence, frame.shared, reader.counters["writers"]) == (1, True, number)
+        assert not writer.wanted
+        assert not writer.write(b"x", FrameInfo())
+        assert reader.read() is None
+        reader.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+@needs_shared_memory
 def test_a_writer_knows_when_its_memory_was_removed(tmp_path: Path) -> None:
     with FrameWriter(tmp_path / "run", "camera", capacity=50_000) as writer:
         assert writer.in_place

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import random
 import signal
@@ -61,6 +62,23 @@ def test_a_readers_view_cannot_be_made_writable() -> None:
         view[0] = 1
     with pytest.raises(ValueError, match="WRITEABLE"):
         view.flags.writeable = True
+
+
+def test_an_array_keeps_its_memory() -> None:
+    pool = zenoh.shm.ShmProvider.default_backend(1 << 20)
+    buffer = pool.alloc(500_000)
+    buffer[:] = b"x" * 500_000
+    view = views.array(zenoh.ZBytes(buffer).as_shm(), 500_000)
+    assert view is not None
+    corner = view.reshape(500, 1000)[400:, ::3]
+    del view, buffer
+    gc.collect()
+    with pytest.raises(zenoh.ZError):
+        pool.alloc(600_000, policy=zenoh.shm.GarbageCollect())
+    assert corner.tobytes() == b"x" * corner.size
+    del corner
+    pool.garbage_collect()
+    assert pool.alloc(600_000)
 
 
 def _unprintable(buffer: object) -> int:
