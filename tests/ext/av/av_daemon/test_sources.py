@@ -48,29 +48,12 @@ Open = Callable[..., Source]
 
 
 @pytest.fixture
-def rpicam(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Installed:
-    return Installed(monkeypatch, tmp_path, "rpicam-vid", "tests.fakes.fake_rpicam")
-
-
-@pytest.fixture
 def opened() -> Iterator[list[Source]]:
     """Sources put in here are closed in the end."""
     sources: list[Source] = []
     yield sources
     for source in sources:
         source.close()
-
-
-@pytest.fixture
-def libcamera(monkeypatch: pytest.MonkeyPatch, rpicam: Installed, opened: list[Source]) -> Open:
-    """Opens one, with a program that behaves as ``fake`` says."""
-
-    def open_(fake: str = "", **video: Any) -> Source:
-        monkeypatch.setenv("FAKE", fake)
-        opened.append(LibcameraCamera(options(video={**SMALL, **video})))
-        return opened[-1]
-
-    return open_
 
 
 @pytest.fixture
@@ -102,8 +85,12 @@ class TestLibcamera:
         assert (data[:2].tobytes(), data[-2:].tobytes()) == (b"\xff\xd8", b"\xff\xd9")
         assert (info.format, info.stride) == ("mjpeg", 0), "its own JPEG is passed on as it is"
 
-    def test_a_wait_can_be_interrupted_and_leaves_no_thread(self, libcamera: Open, rpicam: Installed) -> None:
-        camera = libcamera("quiet")
+    def test_a_wait_can_be_interrupted_and_leaves_no_thread(
+        self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    ) -> None:
+        rpicam = Installed(monkeypatch, tmp_path, "rpicam-vid", "tests.fakes.fake_rpicam")
+        monkeypatch.setenv("FAKE", "quiet")
+        camera = LibcameraCamera(options(video=SMALL))
         assert until(lambda: rpicam.pids)
         threading.Timer(0.1, camera.interrupt).start()
         with pytest.raises(DeviceError, match="signal 9"):

@@ -79,15 +79,14 @@ class ManagerRig(ProgramRobot):
 
     def listed(self) -> bool:
         """True if every script is in the published list, and was asked what it needs."""
-        asked = {entry["file"] for entry in self.newest("autonomy-files").get("files", ()) if entry.get("asked", True)}
-        return bool(self.newest("autonomy-files")) and asked >= set(self.section["scripts"])
-
-    def newest(self, metric: str) -> Any:
-        return self.world.newest(metric)
+        asked = {
+            entry["file"] for entry in self.world.newest("autonomy-files").get("files", ()) if entry.get("asked", True)
+        }
+        return bool(self.world.newest("autonomy-files")) and asked >= set(self.section["scripts"])
 
     @property
     def status(self) -> dict[str, Any]:
-        status: dict[str, Any] = self.newest("autonomy-status")
+        status: dict[str, Any] = self.world.newest("autonomy-status")
         return status
 
     def becomes(self, timeout: float = 10.0, **fields: Any) -> bool:
@@ -173,7 +172,7 @@ def test_a_script_is_listed_started_and_stopped(rig: ManagerRig) -> None:
     folder = rig.script("walk", args=[{"key": "speed", "type": "float", "default": 0.5, "arg": "--speed", "max": 1}])
     rig.script("ours", OURS + SLEEPER)
     rig.start()
-    assert rig.newest("autonomy-files")["files"] == [
+    assert rig.world.newest("autonomy-files")["files"] == [
         {"file": "ours", "label": "Ours",
          "configs": [{"key": "n", "label": "n", "type": "int", "default": 1, "arg": "--n"}]},
         {"file": "walk", "label": "walk",
@@ -245,7 +244,7 @@ def test_a_launcher_logs_a_scripts_lines_under_its_name_and_when_killed_leaves_n
     assert until(lambda: expected in [
         tuple(record[key] for key in ("service", "level", "pid", "message")) for record in mqtt.world.payloads("logs")
     ])  # fmt: skip
-    assert mqtt.newest("capabilities")["value"]["autonomy"]["available"] is True
+    assert mqtt.world.newest("capabilities")["value"]["autonomy"]["available"] is True
     mqtt.end(signal.SIGKILL)
     assert until(lambda: all(map(gone, pids)), 5)
 
