@@ -79,10 +79,9 @@ class ManagerRig(ProgramRobot):
 
     def listed(self) -> bool:
         """True if every script is in the published list, and was asked what it needs."""
-        asked = {
-            entry["file"] for entry in self.world.newest("autonomy-files").get("files", ()) if entry.get("asked", True)
-        }
-        return bool(self.world.newest("autonomy-files")) and asked >= set(self.section["scripts"])
+        newest = self.world.newest("autonomy-files")
+        asked = {entry["file"] for entry in newest.get("files", ()) if entry.get("asked", True)}
+        return bool(newest) and asked >= set(self.section["scripts"])
 
     @property
     def status(self) -> dict[str, Any]:
