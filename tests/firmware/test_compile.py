@@ -1,11 +1,18 @@
-"""Every module of every robot compiles for its board and fits onto it; the pure parts pass in the real MicroPython."""
+"""Every module of every robot compiles for its board and fits onto it; the pure parts pass in the real MicroPython.
+
+And the loop of every board.
+"""
 
 from __future__ import annotations
 
 import ast
 import json
+import runpy
 import shutil
+import sys
 from pathlib import Path
+from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -103,3 +110,40 @@ def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], 
 def test_in_micropython(module: str, name: str, outcomes: dict[tuple[str, str], str]) -> None:
     assert (module, name) in outcomes, f"MicroPython did not run it: {outcomes}"
     assert outcomes[module, name] == "", f"in MicroPython:\n{outcomes[module, name]}"
+
+
+# -- the loop of every board
+
+
+class WasReset(BaseException):
+    """machine.reset() does not return."""
+
+
+def looped(monkeypatch: pytest.MonkeyPatch, **errors: BaseException | type[BaseException]) -> list[Any]:
+    """Run the loop with a robot whose third step fails, and ``errors`` of ``stop`` or ``sleep_ms``; return calls."""
+    board = Mock()
+    board.micropython.const = int
+    board.robot.port = None
+    board.robot.step.side_effect = (None, None, MemoryError)
+    board.robot.stop.side_effect = errors.get("stop")
+    board.time.sleep_ms.side_effect = errors.get("sleep_ms")
+    board.machine.reset.side_effect = WasReset
+    for name in ("machine", "time", "micropython"):
+        monkeypatch.setitem(sys.modules, name, getattr(board, name))
+    loop = runpy.run_path(str(ROOT / "firmware" / "common" / "run.py"))
+    with pytest.raises(KeyboardInterrupt if "sleep_ms" in errors else WasReset):
+        loop["run"](lambda _settings: board.robot, {})
+    return [(name.rpartition(".")[2], *arguments) for name, arguments, _ in board.mock_calls]
+
+
+@pytest.mark.parametrize("errors", [{}, {"stop": MemoryError}])
+def test_a_robot_that_fails_stops_and_starts_anew_also_if_it_cannot_stop(
+    monkeypatch: pytest.MonkeyPatch, errors: dict[str, Any]
+) -> None:
+    calls = looped(monkeypatch, **errors)
+    assert calls[:4] == [("kbd_intr", 3), ("sleep_ms", 1000), ("kbd_intr", -1), ("WDT",)], "Ctrl-C works until then"
+    assert calls[4:] == [("step",), ("feed",)] * 2 + [("step",), ("stop",), ("reset",)]
+
+
+def test_who_comes_in_by_that_door_finds_no_watchdog(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert ("WDT",) not in looped(monkeypatch, sleep_ms=KeyboardInterrupt)

@@ -1,17 +1,31 @@
-"""MiniLAMP's and BenJr's messages and motions, in virtual time."""
+"""MiniLAMP's and BenJr's messages and motions, in virtual time; then with real sockets and a real broker."""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, closing
+from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
 import pytest
 
+from pebble.commands import app
+from pebble.errors import PebbleError
+from pebble.extensions.lab.simulation.trace import read_trace
 from tests.ext.lab.simulation.virtual_broker import Session, VirtualBroker
 from tests.firmware.drill import BASE, DRIVE, ESTOP, LIMIT_S, RESET, STALE_S, STATE, Drill
+from tests.firmware.test_deadman_virtual import HOSTILE
+from tests.firmware.wireless_rig import Robots
+from tests.robot.operator import Operator
+from tests.support import ROOT, Broker, Child, until
+from tests.tcp_proxy import TcpProxy
 from wifi import sockets
 
 KINDS = ("minilamp", "benjr")
@@ -115,16 +129,6 @@ def test_the_battery_every_five_seconds_and_not_retained(kind: str) -> None:
     assert volts["unit"] == "v"
     assert volts["value"] == pytest.approx({"minilamp": 1.6, "benjr": 3.6}[kind], abs=0.01)
     assert published(drill, "charging-status") == ([{"value": False}] * len(levels) if kind == "benjr" else [])
-
-
-def test_reports_get_through_however_long_the_names_are() -> None:
-    identity = {"system": "s" * 64, "type": "t" * 64, "id": "\u540d" * 64}
-    drill = online("benjr", robot=identity, ntp="")
-    drill.run(10)
-    base = "/".join(identity.values())
-    received = [one.message.topic for one in drill.broker.received]
-    assert received.count(f"{base}/outgoing/capabilities") == 1
-    assert received.count(f"{base}/outgoing/charging-status") == received.count(f"{base}/outgoing/charging-level") >= 1
 
 
 def test_it_reconnects_after_more_days_than_ticks_can_measure() -> None:
@@ -239,3 +243,228 @@ def test_what_tls_could_not_send_comes_again_as_it_was(monkeypatch: pytest.Monke
     assert [stream.write(data, count) for count in (9, 18, 18)] == [0, 0, 9]  # more waits by now
     assert stream.write(data[9:], 9) == 9
     assert [bytes(call.args[0]) for call in write.call_args_list] == [b"heartbeat"] * 3 + [b" and more"]
+
+
+# -- with real sockets and a real broker: as programs
+
+
+END_S = 1.0
+NAME = 'The "lamp", naïve'  # as JSON must escape it
+
+
+class Program:
+    """One robot as a process; what it writes goes into files."""
+
+    def __init__(self, folder: Path, kind: str, broker: str, *options: str) -> None:
+        self._files = folder / f"{kind}.out", folder / f"{kind}.err"
+        out, err = (path.open("wb") for path in self._files)
+        command = [sys.executable, "-m", "pebble.cli", "sim", kind, "--broker", broker, *options]
+        with out, err:
+            self.process = Child(command, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=out, stderr=err)
+
+    @property
+    def out(self) -> bytes:
+        return self._files[0].read_bytes()
+
+    @property
+    def err(self) -> str:
+        return self._files[1].read_text()
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Any]:
+    programs: list[Program] = []
+
+    def start(*arguments: str) -> Program:
+        programs.append(Program(tmp_path, *arguments))
+        return programs[-1]
+
+    yield start
+    for program in programs:
+        program.process.kill()
+        program.process.wait()
+
+
+def test_one_is_driven_and_ends_at_once_by_a_signal_with_motors_off(start: Any, broker: Broker, tmp_path: Path) -> None:
+    address, trace = f"127.0.0.1:{broker.port}", tmp_path / "trace.jsonl"
+    program = start("minilamp", f"mqtt://{address}", "--name", NAME, "--trace", str(trace))
+
+    def motors() -> list[Any]:
+        return [entry.motors for entry in read_trace(trace)]
+
+    with closing(Operator(broker.port, "pebble/robots/minilamp")) as operator:
+        assert until(lambda: len(operator.on("outgoing/online")) > 1, 15), program.err
+        operator.send("incoming/drive-values", {"z": 1.0})
+        assert until(lambda: motors() == [(1.0, 1.0), (0.0, 0.0)], 5)
+        began, ended = read_trace(trace)
+        assert 0.8 <= (ended.ns - began.ns) / 1e9 <= 1.2  # after the last command
+        assert f"connected to the broker at {address}" in program.err
+        identity = operator.on("outgoing/capabilities")[-1].json["value"]["identity"]
+        assert identity == {"system": "pebble", "type": "robots", "id": "minilamp", "name": NAME}
+        operator.send("incoming/drive-values", {"z": 1.0})
+        assert until(lambda: motors()[-1] == (1.0, 1.0))
+        program.process.send_signal(signal.SIGTERM)
+        signalled = time.monotonic()
+        assert program.process.wait(10) == 0
+        assert time.monotonic() - signalled <= END_S
+        assert motors()[-1] == (0.0, 0.0)
+
+
+def test_its_files_survive_a_killed_program_which_is_published_as_offline(
+    start: Any, broker: Broker, tmp_path: Path
+) -> None:
+    config = tmp_path / "config.json"
+    config.write_text(json.dumps({"robot": {"id": "benjr"}, "local_mqtt": {"host": "127.0.0.1", "port": broker.port}}))
+    arguments = ("benjr", str(config), "--files", str(tmp_path / "board"))
+    program = start(*arguments)
+    with closing(Operator(broker.port, "pebble/robots/benjr")) as operator:
+
+        def became(metric: str, **fields: Any) -> bool:
+            """Wait until the newest message has these fields."""
+            return until(
+                lambda: any(fields.items() <= one.json.items() for one in operator.on(f"outgoing/{metric}")[-1:]), 15
+            )
+
+        assert became("estop/mcu", latched=False), program.err
+        operator.send("incoming/estop", {"stop": "00000000000000aa"})
+        assert became("estop/mcu", latched=True, persisted=True)
+        program.process.kill()
+        program.process.wait()
+        assert became("online", t=0, online=False)
+        start(*arguments)
+        assert became("estop/mcu", latched=True, count=0, recent=["00000000000000aa"])
+
+
+def test_a_fleet_takes_turns_of_kinds_shows_its_status_and_ends_in_order(start: Any, broker: Broker) -> None:
+    with closing(Operator(broker.port, "pebble/robots")) as operator:
+        program = start("fleet", f"mqtt://127.0.0.1:{broker.port}", "-n", "3")
+        assert until(lambda: b"3 robots: connected" in program.out, 20), program.err
+    program.process.send_signal(signal.SIGTERM)
+    began = time.monotonic()
+    assert program.process.wait(10) == 0
+    assert time.monotonic() - began < 2.0
+    assert "3 of 3 online" in program.err + program.out.decode()
+    assert {"minilamp-001", "benjr-001", "minilamp-002"} <= {one.topic.split("/")[2] for one in operator.seen}
+    assert "Traceback" not in program.err
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (("fleet", "http://x"), "--broker must be mqtt://"),
+        (("minilamp", "mqtt://ann:secret@x"), "holds a password"),
+        (("benjr", "nowhere.json"), "nowhere.json"),
+        (("fleet", "mqtt://127.0.0.1", "-n", "1001"), "1000"),
+        (("minilamp", "mqtt://127.0.0.1", "a/b"), "robot.id"),
+        (("benjr", "mqtts://127.0.0.1"), "memory"),
+    ],
+)
+def test_what_makes_no_sense_is_one_line(options: tuple[str, ...], named: str) -> None:
+    kind, broker, *more = options
+    with pytest.raises(PebbleError) as error:
+        app.run(["sim", kind, "--broker", broker, *more])
+    assert named in str(error.value)
+    assert "secret" not in str(error.value)
+    assert len(str(error.value).splitlines()) == 1
+
+
+# -- whatever arrives or fails, motors are off in time and heartbeats go on
+
+
+HUGE = (b'{"x": 0, "z": 1, "pad": "' + b"x" * 100_000 + b'"}', b"[" * 100_000, b'{"z": 1' + b"0" * 900 + b"}")
+RATE_HZ, EVERY_S = 4.0, 0.05
+
+
+class Hall:
+    """A broker, a link to one robot of each kind, and an operator; while they connect, a command is retained."""
+
+    def __init__(self, folder: Path, stack: ExitStack) -> None:
+        self.broker = Broker(folder)
+        stack.callback(self.broker.kill)
+        self.link = stack.enter_context(TcpProxy(self.broker.port))
+        self.operator = stack.enter_context(closing(Operator(self.broker.port, "pebble/robots", "+/outgoing/online")))
+        self.send(b'{"x": 0, "z": 1}', retain=True)
+        self.robots = stack.enter_context(Robots("127.0.0.1", self.link.port))
+        self.robots.wait_online()
+        assert self.beating(time.monotonic())
+        self.have_not_moved()
+
+    def moving(self) -> bool:
+        return all(map(self.robots.moving, KINDS))
+
+    def resting(self) -> bool:
+        return not any(map(self.robots.moving, KINDS))
+
+    def drive(self, z: float = 0.8) -> float:
+        """Return when the broker had it."""
+        self.send({"x": 0.0, "z": z})
+        return time.monotonic()
+
+    def send(self, body: Any, **options: Any) -> None:
+        """Publish a drive command to each robot, and wait until the broker has it."""
+        for info in [self.operator.send(f"{kind}/incoming/drive-values", body, **options) for kind in KINDS]:
+            info.wait_for_publish(5)
+
+    def heartbeats(self, kind: str, since: float) -> list[dict[str, Any]]:
+        beats = [one.json for one in self.operator.on(f"{kind}/outgoing/online", since) if not one.retain]
+        return [beat for beat in beats if beat["online"]]
+
+    def beating(self, since: float, count: float = 2.0) -> bool:
+        return until(lambda: all(len(self.heartbeats(kind, since)) > count for kind in KINDS))
+
+    def have_not_moved(self) -> None:
+        assert [self.robots.moves[kind] for kind in KINDS] == [[], []]
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
+    with ExitStack() as stack:
+        yield Hall(tmp_path_factory.mktemp("hall"), stack)
+
+
+@pytest.fixture
+def hall(running: Hall) -> Hall:
+    """With robots online, free and at rest."""
+    running.robots.wait_online()
+    assert until(running.resting)
+    for moves in running.robots.moves.values():
+        moves.clear()
+    return running
+
+
+def test_nothing_hostile_moves_a_robot_or_stops_its_heartbeat(hall: Hall) -> None:
+    began = time.monotonic()
+    for number, payload in enumerate((*HOSTILE, *HUGE)):
+        hall.send(payload, qos=number % 2)
+        time.sleep(EVERY_S)
+    assert hall.beating(began, 2.5 * RATE_HZ)
+    hall.have_not_moved()
+    for kind in KINDS:
+        stamps = [beat["t"] for beat in hall.heartbeats(kind, began)]
+        assert (len(stamps) - 1) / (stamps[-1] - stamps[0]) * 1000 == pytest.approx(RATE_HZ, rel=0.1)
+        assert hall.robots.robots[kind].online
+    hall.drive()
+    assert until(hall.moving)
+    assert hall.robots.alive
+
+
+@pytest.mark.parametrize("fault", ["black hole", "broker killed"])
+def test_motors_are_off_within_a_second_and_no_retained_command_moves_them_afterwards(hall: Hall, fault: str) -> None:
+    begin, end = {
+        "black hole": (hall.link.blackhole, hall.link.resume),
+        "broker killed": (hall.broker.kill, hall.broker.start),
+    }[fault]
+    last = hall.drive()
+    assert until(hall.moving)
+    begin()
+    assert until(hall.resting, 3.0)
+    for kind in KINDS:
+        assert hall.robots.stopped_at(kind) - last <= LIMIT_S, kind
+    assert until(lambda: not any(robot.online for robot in hall.robots.robots.values()))
+    end()
+    moves = {kind: len(moves) for kind, moves in hall.robots.moves.items()}
+    hall.robots.wait_online(20.0)
+    assert hall.beating(time.monotonic())
+    assert {kind: len(moves) for kind, moves in hall.robots.moves.items()} == moves
+    assert until(lambda: hall.drive() and hall.moving(), step=EVERY_S)
+    assert hall.robots.alive

@@ -10,13 +10,16 @@ from types import TracebackType
 from typing import Any, Self
 
 import msgspec
+import numpy as np
 
 from pebble.contract.payloads import MediaReport
-from pebble.extensions.media.frames import FrameWriter
+from pebble.extensions.media.frames import FrameInfo, FrameWriter
 from pebble.transports import Message, MqttSettings, QoS, State, Transport, create
 from tests.kit.robot import BASE as BASE
 from tests.kit.robot import ROBOT, SILENCE_S, Program, ProgramRobot
 from tests.support import until
+
+WIDTH, HEIGHT = 320, 240
 
 
 class MediaProgram(ProgramRobot):
@@ -95,6 +98,19 @@ class Device(ABC):
             number += 1
             if self.writer.wanted:
                 self.write(number)
+
+
+class Filming(Device):
+    """A camera of one colour."""
+
+    def __init__(self, folder: Path) -> None:
+        self._picture = np.full((HEIGHT, WIDTH, 3), (10, 20, 30), np.uint8)
+        super().__init__(folder, "camera", 50, self._picture.size)
+
+    def write(self, number: int) -> None:
+        info = FrameInfo(format="bgr24", width=WIDTH, height=HEIGHT, captured_ns=time.monotonic_ns())
+        self.writer.write(b"no picture", FrameInfo(format="text"))
+        self.writer.write(self._picture, info)
 
 
 class Operator(ABC):

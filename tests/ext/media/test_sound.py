@@ -6,8 +6,10 @@ import json
 import random
 import sys
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pytest
 
@@ -24,6 +26,7 @@ from pebble.extensions.media.sound import (
     sequence_numbers,
     unpack,
 )
+from pebble.extensions.media.sound_file import SoundFile
 from pebble.extensions.media.speech import Speech
 from tests.kit.sound import envelope
 from tests.vectors import make_pbat
@@ -180,23 +183,6 @@ def test_an_unknown_encoding_is_named() -> None:
         make_sound_encoder("mp3", rate=16000, channels=1)
 
 
-def test_hostile_packets() -> None:
-    """Bits turned, ends cut, headers made up: refused or heard, nothing else."""
-    randoms = random.Random(5)
-    good = packets("pcm", speech(16000)[:1600], 16000) + packets("opus", speech(16000)[:6400], 16000, bundle=2)
-    decoder = SoundDecoder()
-    for _ in range(1500):
-        raw = bytearray(randoms.choice(good))
-        for _ in range(randoms.randrange(1, 6)):
-            raw[randoms.randrange(len(raw))] = randoms.randrange(256)
-        decoder.feed(bytes(raw[: randoms.randrange(len(raw) + 1)] if randoms.random() < 0.3 else raw))
-    counted = decoder.counters.snapshot()
-    assert counted["packets"] + counted["refused"] == 1500
-    assert min(counted.values()) > 40
-    after = [decoder.feed(raw) for raw in good[:5]]
-    assert all(one is not None for one in after)
-
-
 def test_hostile_bodies_of_opus() -> None:
     randoms = random.Random(6)
     for _ in range(1500):
@@ -238,3 +224,52 @@ def test_remixing() -> None:
     assert remix(stereo[:, :1], 2).tolist() == [[100, 100], [-32768, -32768]]
     assert to_samples(b"\1\0\2\0\3\0\4", 2).tolist() == [[1, 2]], "an unfinished sample is left out"
     assert make_sound_encoder("opus", rate=16000, channels=6).channels == 1
+
+
+# -- sound files
+
+
+SOUND = np.stack([np.arange(-20_000, 20_000, 4), np.arange(20_000, -20_000, -4)], axis=1).astype(np.int16)
+
+
+def samples(path: Path, rate: int = 8000) -> np.ndarray:
+    with SoundFile(path) as file:
+        assert file.rate == rate
+        return np.frombuffer(b"".join(file.chunks()), "<i2").reshape(-1, file.channels)
+
+
+def test_flac_is_the_same_and_the_others_as_long(tmp_path: Path) -> None:
+    assert np.array_equal(samples(encode(tmp_path / "a.flac", SOUND, 8000)), SOUND)
+    assert len(samples(encode(tmp_path / "a.mp3", SOUND, 8000))) == pytest.approx(len(SOUND), abs=3000)
+    opus = samples(encode(tmp_path / "a.ogg", SOUND, 48_000), rate=48_000)
+    assert len(opus) == pytest.approx(len(SOUND), abs=3000)
+
+
+@pytest.mark.parametrize("ending", ["mp3", "ogg", "flac"])
+@pytest.mark.parametrize("content", [b"", b"#EXTM3U\n#EXTINF:1,\nhttp://127.0.0.1:9/a.mp3\n", bytes(3000)])
+def test_what_is_no_sound_is_refused(tmp_path: Path, ending: str, content: bytes) -> None:
+    path = tmp_path / f"a.{ending}"
+    path.write_bytes(content)
+    with pytest.raises(PebbleError, match="a"):
+        samples(path)
+
+
+_CODECS = {".mp3": "libmp3lame", ".ogg": "libopus", ".flac": "flac"}
+_FORMATS = {"libmp3lame": "s16p", "libopus": "s16", "flac": "s16"}
+
+
+def encode(path: Path, samples: Samples, rate: int) -> Path:
+    """``samples`` are (samples, channels); one or two channels. Ogg holds Opus, which is decoded at 48 kHz."""
+    codec, layout = _CODECS[path.suffix], "mono" if samples.shape[1] == 1 else "stereo"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=rate, layout=layout)
+        stream.format = _FORMATS[codec]
+        resampler = av.AudioResampler(format=_FORMATS[codec], layout=layout, rate=rate)
+        for start in range(0, len(samples), 1024):
+            piece = np.ascontiguousarray(samples[start : start + 1024]).reshape(1, -1)
+            frame = av.AudioFrame.from_ndarray(piece, format="s16", layout=layout)
+            frame.sample_rate, frame.pts = rate, start
+            for made in resampler.resample(frame):
+                container.mux(stream.encode(made))
+        container.mux(stream.encode(None))
+    return path

@@ -21,7 +21,7 @@ from pebble.extensions.media.pcm import Samples
 from pebble.services.soundboard_handler.clips import Clips
 from pebble.services.soundboard_handler.service import SoundboardHandler
 from pebble.transports import QoS
-from tests.ext.media.test_sound_file import encode
+from tests.ext.media.test_sound import encode
 from tests.kit.robot import Program, ProgramRobot
 from tests.support import ROOT, Broker, Child, gone, until
 
@@ -202,7 +202,6 @@ def test_what_plays_and_what_stops(make: Make) -> None:
 
 
 def test_files_that_are_not_there_or_not_inside(board: Soundboard) -> None:
-    """The files inside are those of test_clips.py."""
     outside = write_wav(board.folder / "outside.wav", tone(0.1))
     board.with_clip("inside.wav", 0.1)
     for name in (str(outside), "..\\outside.wav", "a" * 300 + ".wav"):
@@ -218,13 +217,6 @@ def test_what_goes_wrong_with_a_player_is_reported_and_not_repeated(board: Sound
     assert board.players() == []
     board.play(" good.wav ")  # blanks are left out
     assert board.became(playing=True, file="good.wav", error=None), "the next command clears the error"
-
-
-def test_a_player_that_is_missing_is_reported(make: Make) -> None:
-    board = make(player_command=["no-such-player"], clip=0.1)
-    board.play("a.wav")
-    error = "Failed to start playback: [Errno 2] No such file or directory: 'no-such-player'"
-    assert board.became(playing=False, error=error)
 
 
 def test_the_list_follows_the_folder_and_an_unchanged_one_is_not_published_again(board: Soundboard) -> None:
@@ -312,7 +304,7 @@ def test_a_loudspeaker_that_talk_back_has_is_busy(make: Make, doing: str, error:
 
 
 def test_other_formats_are_decoded_and_played(board: Soundboard) -> None:
-    """What can be decoded is in tests/ext/media/test_sound_file.py."""
+    """What can be decoded is in tests/ext/media/test_sound.py."""
     sound = tone(0.5, 2, 48_000)
     encode(board.sounds / "tone.flac", sound, 48_000)
     (board.sounds / "bad.ogg").write_bytes(b"no sound " * 100)

@@ -1,7 +1,12 @@
 """The board's side of goob_base_v1 and of pebble_serial_v1."""
 
+import random
+import struct
+from math import cos, pi, sin
+
 from common.frames import Decoder, Sender, crc16
 from common.lines import Lines, clamp, number
+from goob_imu.imu import Imu
 
 
 class Recorder:
@@ -42,6 +47,9 @@ OBEYED = (
     (b"F 0.25 0.5 1 1.5\n", b"OK F", [("F", [0.25, 0.5, 1.0, 1.5])]),
     (b" \tM\t 1   1  \r\n", b"OK M", M_ONE),
     (b"\n\r\n \n\t\n", b"", []),
+    (b"m 9 -9 spare\n", b"OK M", [("M", [9.0, -9.0])]),
+    (b"M nan inf\n", b"OK M", [("M", [0.0, 0.0])]),
+    (b"M x 0.5y\n", b"OK M", [("M", [0.0, 0.5])]),
     (b"m\n", b"ERR M needs 2 values", []),
     (b"\x03M 1 1\n", b"ERR unknown command", []),
     (b"M 1 1 " + b"x" * 250 + b"\n", b"OK M", M_ONE),  # 256 bytes
@@ -100,14 +108,17 @@ def test_a_host_that_does_not_read_loses_whole_lines():
     assert calls.commands, "it is obeyed all the same"
 
 
+def noise(count):
+    return bytes([random.getrandbits(8) for _ in range(count)])
+
+
 def test_noise_among_lines():
+    random.seed(1)
     calls = Recorder()
-    value = 1
     known = 0
     for _ in range(5_000):
-        for _ in range(8):
-            value = (value * 1103515245 + 12345) & 0x3FFFFFFF
-            calls.lines.take(value >> 16 & 0xFF)
+        for byte in noise(8):
+            calls.lines.take(byte)
         calls.lines.first = calls.lines.used = 0
         for letter, numbers in calls.commands:
             known += letter in "MLF"
@@ -167,18 +178,6 @@ def received(data, decoder=None):
     return [(decoder.kind, decoder.interface, decoder.sequence) for byte in data if decoder.take(byte)]
 
 
-class Noise:
-    def __init__(self, seed):
-        self.value = seed
-
-    def next(self, limit):
-        self.value = (self.value * 1103515245 + 12345) & 0x3FFFFFFF
-        return (self.value >> 14) % limit
-
-    def bytes(self, count):
-        return bytes([self.next(256) for _ in range(count)])
-
-
 def test_known_vectors():
     assert crc16(b"123456789 and more", 9) == 0x29B1
     assert received(b"\0\0" + DESCRIBE_REQ + b"\0" + CMD) == [(0x02, 0, 0), (0x20, 3, 1)]
@@ -190,11 +189,11 @@ def test_known_vectors():
 
 
 def test_sent_frames_decode_to_their_content():
-    noise = Noise(7)
+    random.seed(7)
     sender = Sender(512)
     for count in range(400):
-        sequence, now = noise.next(1 << 16), noise.next(1 << 16)
-        data = noise.bytes(count) if count % 3 else bytes([1 + count % 255]) * count
+        sequence, now = random.getrandbits(16), random.getrandbits(16)
+        data = noise(count) if count % 3 else bytes([1 + count % 255]) * count
         assert sender.send(0x10, 300, sequence, now, data)
         body = plain(taken(sender))
         head = b"\x01\x10\x00\x2c\x01" + sequence.to_bytes(4, "little") + now.to_bytes(4, "little")
@@ -236,10 +235,181 @@ def test_frames_of_every_length_up_to_160_bytes():
 
 
 def test_noise_among_frames():
-    noise = Noise(3)
+    random.seed(3)
     decoder = Decoder()
     sound = 0
     for _ in range(5_000):
-        sound += len(received(noise.bytes(noise.next(24)) + b"\0", decoder))
+        sound += len(received(noise(random.getrandbits(4)) + b"\0", decoder))
     assert sound < 5, "a CRC of 16 bits lets one of 65,536 pass"
     assert received(CMD, decoder) == [(0x20, 3, 1)]
+
+
+# -- from the MPU-6050's raw numbers to what goes to the host
+
+
+G = 8192  # LSB
+DPS = 65.5  # LSB
+
+
+class Device:
+    """Lies flat and at rest by default; fails ``failures`` times."""
+
+    def __init__(self):
+        self.raw = [0, 0, G, 0, 0, 0, 0]
+        self.failures = 0
+        self.starts = 0
+        self.right = True
+
+    def start(self):
+        self.starts += 1
+        self._maybe_fail()
+        return self.right
+
+    def read(self, data):
+        self._maybe_fail()
+        struct.pack_into(">7h", data, 0, *self.raw)
+
+    def _maybe_fail(self):
+        if self.failures:
+            self.failures -= 1
+            raise OSError(5)
+
+
+class Bench:
+    def __init__(self):
+        self.device = Device()
+        self.messages = []
+        self.now = 0
+        self.imu = Imu(self.device, self.messages.append)
+
+    def sample(self, count=1):
+        """How many of ``count`` samples, 10 ms apart, brought something."""
+        good = 0
+        for _ in range(count):
+            good += self.imu.read(self.now)
+            self.now = (self.now + 10) & (1 << 30) - 1
+        return good
+
+
+def near(value, wanted, off):
+    return abs(value - wanted) <= off
+
+
+def test_units():
+    bench = Bench()
+    bench.device.raw = [G // 2, -G, G, 0, 655, -1310, 131]
+    bench.sample(2)
+    ax, ay, az, gx, gy, gz, celsius, _, _ = bench.imu.values
+    assert near(ax, 4903, 1)
+    assert near(ay, -9807, 1)
+    assert near(az, 9807, 1)
+    assert near(gx, 1000, 1)
+    assert near(gy, -2000, 1)
+    assert near(gz, 200, 1)
+    assert celsius == 3653
+    bench.device.raw[3] = -340 * 50
+    bench.sample()
+    assert bench.imu.values[6] == -1347
+
+
+def test_what_the_wire_cannot_hold_is_cut_off():
+    bench = Bench()
+    bench.device.raw = [32767, -32768, 32767, 0, 32767, -32768, 32767]
+    bench.sample(300)
+    assert bench.imu.calibrated == 0, "nothing at rest turns like this"
+    assert bench.imu.values[:6] == [32767, -32768, 32767, 32767, -32768, 32767]
+    struct.pack("<9h", *bench.imu.values)
+
+
+def test_it_learns_the_bias_of_the_gyroscope_at_rest():
+    bench = Bench()
+    bench.device.raw = [0, 0, G, 0, 79, -52, 29]
+    bench.sample(210)
+    assert bench.imu.calibrated == 200 - 1  # one turn set it up, ten samples came first
+    assert near(bench.imu.values[3], 121, 1), "until then it is as measured"
+    bench.sample(2)
+    assert bench.imu.calibrated == 200
+    assert near(bench.imu.bias[0], 121, 1)
+    assert near(bench.imu.bias[1], -79, 1)
+    assert near(bench.imu.bias[2], 44, 1)
+    assert bench.imu.values[3:6] == [0, 0, 0]
+    assert bench.messages == [b"imu_ready"]
+    bench.device.raw[4] += 655
+    bench.sample()
+    assert near(bench.imu.values[3], 1000, 1)
+
+
+def test_it_does_not_learn_while_it_is_moved():
+    bench = Bench()
+    bench.sample(150)
+    bench.device.raw[6] = 6550
+    bench.sample(5)
+    bench.device.raw[6] = 0
+    bench.sample(100)
+    assert bench.imu.calibrated < 200
+    bench.sample(110)
+    assert bench.imu.calibrated == 200
+    assert bench.imu.bias == [0, 0, 0]
+
+
+def test_attitude_at_once_after_the_start():
+    for degrees in (-170, -80, 0, 45, 80, 120):
+        bench = Bench()
+        angle = degrees * pi / 180
+        bench.device.raw[1], bench.device.raw[2] = int(G * sin(angle)), int(G * cos(angle))
+        bench.sample(2)
+        assert near(bench.imu.values[7], degrees * 100, 5)
+        assert near(bench.imu.values[8], 0, 5)
+        if abs(degrees) < 90:
+            bench = Bench()
+            bench.device.raw[0], bench.device.raw[2] = int(-G * sin(angle)), int(G * cos(angle))
+            bench.sample(2)
+            assert near(bench.imu.values[8], degrees * 100, 5)
+
+
+def test_free_fall_keeps_the_attitude():
+    bench = Bench()
+    bench.device.raw = [0, 1000, 1000, 0, 0, 0, 0]
+    bench.sample(5)
+    bench.device.raw = [0, 0, 0, 1, 0, 0, 0]
+    bench.sample(5)
+    assert near(bench.imu.values[7], 4500, 5)
+
+
+def test_a_failure_is_logged_and_a_device_that_fell_asleep_or_is_another_is_set_up_anew():
+    bench = Bench()
+    bench.sample(10)
+    bench.device.failures = 1
+    assert bench.sample(10) == 9
+    assert (bench.imu.failed, bench.device.starts) == (1, 1)
+    bench.device.raw = [0] * 7  # all its registers are 0 then, and it answers
+    assert bench.sample(104) == 0
+    bench.device.raw = [0, 0, G, 0, 0, 0, 0]
+    assert bench.sample(11) == 10
+    assert bench.messages == [b"imu_ready"] + [b"imu_read_failed"] * 2 + [b"imu_reinit"]
+    bench = Bench()
+    bench.device.right = False
+    assert bench.sample(101) == 0
+    assert bench.messages == [b"imu_init_failed"] * 2
+
+
+def test_the_ticks_may_wrap():
+    bench = Bench()
+    bench.now = (1 << 30) - 500
+    bench.device.failures = 1
+    assert bench.sample(101) == 0
+    assert bench.sample(212) == 212
+    bench.device.raw[4] = int(100 * DPS)
+    bench.sample(1)
+    assert 90 < bench.imu.values[7] <= 100
+
+
+def test_pitch_ends_upright_however_it_turns():
+    bench = Bench()
+    bench.device.raw = [0, 0, G, 0, 0, 30_000, 0]
+    bench.imu.calibrated = 200
+    for gap in (10, 490):
+        for _ in range(100):
+            bench.now += gap
+            bench.imu.read(bench.now)
+        assert -9000 <= bench.imu.values[8] <= 9000

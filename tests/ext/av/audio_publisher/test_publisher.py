@@ -188,14 +188,9 @@ def test_steps_back_are_tried_ever_more_rarely() -> None:
     watch(levels, 0.18, 10.0, 3.0)
     tries, at = [], 13.0
     for _ in range(4):
-        begin = at
-        while levels.level == 2:
-            at += 0.02
-            levels.poll(0.0, at)
-        tries.append(at - begin)
-        while levels.level == 1:
-            at += 0.02
-            levels.poll(0.18, at)
+        tries.append(next(0.02 * number for number in range(50_000) if levels.poll(0.0, at + 0.02 * number)))
+        at += tries[-1]
+        at += next(0.02 * number for number in range(50_000) if levels.poll(0.18, at + 0.02 * number))
     assert tries[0] > 5
     assert tries == sorted(tries)
     assert tries[-1] > 4 * tries[0]

@@ -1,20 +1,30 @@
-"""Views look into shared memory; they are certain about it, or they are not used."""
+"""Views look into shared memory, or are not used. Every pixel format becomes the same picture."""
 
 from __future__ import annotations
 
 import gc
+import json
+import random
 import signal
 import subprocess
 import sys
+import tempfile
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import zenoh
 import zenoh.shm
 
-from pebble.errors import TransportError
-from pebble.extensions.media.frames import FrameInfo, FrameReader, FrameWriter, views
+from pebble import camera
+from pebble.config import default_run_folder
+from pebble.errors import PayloadError, PebbleError, TransportError
+from pebble.extensions.media.frames import Frame, FrameInfo, FrameReader, FrameWriter, views
+from pebble.extensions.media.frames.frame import PICTURE_FORMATS, picture
+from tests.ext.av.media_rig import Filming
 from tests.locking import needs_shared_memory
 from tests.support import ROOT, Child, until
 
@@ -195,3 +205,150 @@ def test_a_frame_that_was_held_too_long_is_invalid(tmp_path: Path) -> None:
         finally:
             holder.kill()
             holder.wait()
+
+
+# -- pictures
+
+
+WIDTH, HEIGHT = 64, 48
+
+
+def _scene() -> np.ndarray:
+    """Smooth, because formats with less colour than pixels blur edges."""
+    ramp = np.linspace(40, 200, WIDTH, dtype=np.uint8)
+    scene = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    scene[..., 0], scene[..., 1], scene[..., 2] = ramp, ramp[::-1], np.linspace(60, 180, HEIGHT)[:, None]
+    return scene
+
+
+def _yuyv(scene: np.ndarray) -> np.ndarray:
+    packed = np.empty((HEIGHT, WIDTH, 2), np.uint8)
+    i420 = cv2.cvtColor(scene, cv2.COLOR_BGR2YUV_I420)
+    packed[..., 0] = i420[:HEIGHT]
+    chroma = i420[HEIGHT:].reshape(2, HEIGHT // 2, WIDTH // 2).repeat(2, axis=1)
+    packed[:, ::2, 1], packed[:, 1::2, 1] = chroma
+    return packed
+
+
+def _nv12(scene: np.ndarray) -> np.ndarray:
+    i420 = cv2.cvtColor(scene, cv2.COLOR_BGR2YUV_I420)
+    chroma = i420[HEIGHT:].reshape(2, -1)
+    return np.concatenate([i420[:HEIGHT].reshape(-1), chroma.T.reshape(-1)])
+
+
+def _mjpeg(scene: np.ndarray) -> np.ndarray:
+    return cv2.imencode(".jpg", scene, [cv2.IMWRITE_JPEG_QUALITY, 95])[1]
+
+
+MAKERS = {"bgr24": np.asarray, "nv12": _nv12, "yuyv": _yuyv, "mjpeg": _mjpeg}
+
+
+@pytest.mark.parametrize("form", PICTURE_FORMATS)
+@pytest.mark.parametrize("writable", [True, False])
+def test_every_format_shows_the_same(form: str, writable: bool) -> None:
+    data = MAKERS[form](_scene()).reshape(-1).copy()
+    data.flags.writeable = writable  # a view is not
+    found = Frame(FrameInfo(format=form, width=WIDTH, height=HEIGHT), data, shared=False).picture()
+    assert found.shape == (HEIGHT, WIDTH, 3)
+    assert np.abs(found.astype(int) - _scene()).mean() < 4
+
+
+@pytest.mark.parametrize("form", PICTURE_FORMATS)
+@pytest.mark.parametrize("width", [8, 20, 100])
+def test_a_reader_may_want_another_width(form: str, width: int) -> None:
+    found = picture(MAKERS[form](_scene()).reshape(-1), FrameInfo(format=form, width=WIDTH, height=HEIGHT), width)
+    assert found.shape == (width * HEIGHT // WIDTH, width, 3)
+    assert abs(found.mean() - _scene().mean()) < 4
+
+
+def test_rows_may_be_longer_than_their_pixels() -> None:
+    padded = np.zeros((HEIGHT, WIDTH * 3 + 10), np.uint8)
+    padded[:, : WIDTH * 3] = _scene().reshape(HEIGHT, -1)
+    info = FrameInfo(format="bgr24", width=WIDTH, height=HEIGHT, stride=WIDTH * 3 + 10)
+    assert (picture(padded.reshape(-1)[:-10], info) == _scene()).all()
+
+
+@pytest.mark.parametrize(
+    "info",
+    [
+        FrameInfo(format="s16le", rate=16000, channels=1),
+        FrameInfo(),
+        FrameInfo(format="bgr24", width=-1, height=-1),
+        FrameInfo(format="bgr24", width=1 << 40, height=1 << 40),
+        FrameInfo(format="bgr24", width=64, height=48, stride=1),
+        FrameInfo(format="nv12", width=63, height=48),
+        FrameInfo(format="mjpeg", width=64, height=48),
+    ],
+)
+def test_what_is_no_picture_is_an_error(info: FrameInfo) -> None:
+    with pytest.raises(PayloadError):
+        picture(np.zeros(1000, np.uint8), info)
+    with pytest.raises(PayloadError):
+        picture(np.zeros(0, np.uint8), info)
+
+
+def test_garbage_is_an_error_and_never_a_crash() -> None:
+    chance = random.Random(1)
+    jpeg = _mjpeg(_scene()).reshape(-1)
+    for _ in range(2000):
+        data = jpeg[: chance.randrange(jpeg.size)].copy()
+        data[chance.randrange(data.size) if data.size else 0 :] = chance.randrange(256)
+        numbers = [chance.choice([-1, 0, 1, 2, 48, 64, 4096, 1 << 62]) for _ in range(3)]
+        info = FrameInfo(format=chance.choice(PICTURE_FORMATS), width=numbers[0], height=numbers[1], stride=numbers[2])
+        try:
+            found = picture(data, info, chance.choice([None, 1, 32]))
+        except PayloadError:
+            continue
+        assert found.ndim == 3
+
+
+# -- three lines of anybody's Python read a robot's camera
+
+
+@pytest.fixture
+def env() -> Iterator[dict[str, str]]:
+    with tempfile.TemporaryDirectory(prefix="pebble-") as folder:  # pytest's own may be too long for a socket
+        yield {"TMPDIR": folder}
+
+
+@pytest.fixture
+def filming(env: dict[str, str]) -> Iterator[Filming]:
+    with Filming(default_run_folder("pebble/robots/goob", env)) as filming:
+        yield filming
+
+
+@needs_shared_memory
+def test_pictures_of_a_robot_by_its_id_its_base_topic_its_run_directory_and_its_config(
+    filming: Filming, env: dict[str, str], tmp_path: Path
+) -> None:
+    config = tmp_path / "goob.json"
+    config.write_text(json.dumps({"robot": {"id": "goob"}}))
+    for robot in ("goob", "pebble/robots/goob", default_run_folder("pebble/robots/goob", env), config, str(config)):
+        with camera(robot, env=env, timeout=5) as pictures:
+            picture = next(pictures)
+            assert (picture.shape, picture[5, 5].tolist()) == ((240, 320, 3), [10, 20, 30])
+            picture[:] = 0  # it is ours
+    with camera("goob", env=env, views=True, timeout=5) as pictures:
+        assert not next(pictures).flags.writeable, "it is the camera's own memory"
+        assert pictures.frame is not None
+        assert pictures.frame.valid()
+        assert pictures.frame.info.captured_ns > 0
+
+
+def test_no_such_robot_is_one_clear_sentence(env: dict[str, str]) -> None:
+    with pytest.raises(PebbleError, match=r"no robot fred runs on this machine \(no .*pebble-.*config"):
+        camera("fred", env=env)
+    for wrong in ("a/b", "", "go#b", "/nowhere/robot.json"):
+        with pytest.raises(PebbleError):
+            camera(wrong, env=env)
+    with pytest.raises(PebbleError, match="width"):
+        camera("fred", width=0)
+
+
+def test_a_robot_without_a_picture_raises_after_the_timeout_and_closing_ends_the_iteration(env: dict[str, str]) -> None:
+    default_run_folder("pebble/robots/goob", env).mkdir(parents=True)
+    with pytest.raises(PebbleError, match=r"no picture for 0\.1 s"):
+        next(camera("goob", env=env, timeout=0.1))
+    pictures = camera("goob", env=env)
+    threading.Timer(0.1, pictures.close).start()
+    assert list(pictures) == []

@@ -10,21 +10,20 @@ import cv2
 import pytest
 
 from tests.commands.command_line import Run, config_file
-from tests.ext.media.test_cameras import HEIGHT, WIDTH, Filming
+from tests.ext.av.media_rig import HEIGHT, WIDTH, Filming
 from tests.support import Broker
 
 
 @pytest.fixture
 def config(tmp_path: Path) -> Iterator[Path]:
     broker = Broker(tmp_path)
-    with tempfile.TemporaryDirectory(prefix="pebble-") as run_dir:  # pytest's own may be too long for a socket
-        filming = Filming(Path(run_dir))
+    # pytest's own folder may be too long for a socket
+    with tempfile.TemporaryDirectory(prefix="pebble-") as run_dir, Filming(Path(run_dir)):
         yield config_file(
             tmp_path,
             local_mqtt={"host": "127.0.0.1", "port": broker.port},
             transport={"kind": "mqtt", "run_dir": run_dir},
         )
-        filming.close()
     broker.stop()
 
 

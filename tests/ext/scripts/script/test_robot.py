@@ -19,7 +19,7 @@ from pebble.contract.payloads import Drive, WheelOdometry
 from pebble.errors import PebbleError
 from pebble.extensions.scripts.script import Robot, Stopped
 from pebble.transports.memory import MemoryHub, MemoryTransport
-from tests.ext.media.test_cameras import HEIGHT, WIDTH, Filming
+from tests.ext.av.media_rig import HEIGHT, WIDTH, Filming
 from tests.support import until
 
 BASE = "pebble/robots/goob"
@@ -165,11 +165,8 @@ def test_a_wait_ends_with_the_script(setting: Setting, wait: Callable[[Robot], o
 
 def test_pictures_in_a_loop_over_them_and_in_a_loop_of_its_own(setting: Setting) -> None:
     robot = setting.robot
-    filming = Filming(robot.config.run_dir())
-    try:
+    with Filming(robot.config.run_dir()):
         assert next(robot.camera()).shape == (HEIGHT, WIDTH, 3)
         assert until(lambda: robot.picture(max_age=0.5) is not None)
         assert robot.picture(max_age=0.0) is None
-    finally:
-        filming.close()
     assert until(lambda: robot.picture(max_age=0.2) is None)

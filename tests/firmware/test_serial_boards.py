@@ -1,29 +1,197 @@
-"""Goob's and Fred's boards, whatever the host does: motors stop in time, nothing blocks the loop, faults reset them.
+"""Boards on a serial line, in virtual time: motors stop in time, nothing blocks the loop, faults reset them.
 
-Also what is different with MicroPython's official image for the XIAO SAMD21, without select and sys.stdin.buffer, and
-the loop of every board.
+Also what is different with MicroPython's official image for the XIAO SAMD21, without select and sys.stdin.buffer.
 """
 
 from __future__ import annotations
 
 import random
 import re
-import runpy
-import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any
-from unittest.mock import Mock
 
 import pytest
 
+from common.frames import crc16
+from goob_imu.manifest import MANIFEST
+from pebble.extensions.lab.simulation.bodies import body_of
+from pebble.extensions.lab.simulation.micropython.board import Board
+from pebble.extensions.lab.simulation.micropython.clock import VirtualClock
 from pebble.extensions.lab.simulation.micropython.modules.machine import Machine
-from pebble.extensions.lab.simulation.micropython.ports import SAMD21_OFFICIAL
+from pebble.extensions.lab.simulation.micropython.ports import SAMD21_OFFICIAL, Port
 from pebble.extensions.lab.simulation.micropython.timers import BoardReset
-from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import Type
-from tests.firmware.benches import ASK, Bench, of
-from tests.support import ROOT, some
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import Frame, FrameError, Type, decode, encode
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import Manifest, parse_describe, parse_hello
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.struct_v1 import unpack
+from tests.ext.boards.mcu_wire import IMU
+from tests.support import some
 
 pytestmark = pytest.mark.computing
+
+ASK = encode(Frame(Type.DESCRIBE_REQ))
+
+
+class _ChangedMachine:
+    """Stands where a radio would: the modules of a boot, of which it provides ``machine``."""
+
+    def __init__(self, change: Callable[[Machine], None]) -> None:
+        self.change = change
+        self.board: Any = None
+
+    def modules(self) -> dict[str, Any]:
+        machine = Machine(self.board)
+        self.change(machine)
+        return {"machine": machine}
+
+
+class Bench:
+    """``change`` gets the ``machine`` module of each boot, before the firmware does."""
+
+    def __init__(
+        self,
+        kind: str,
+        *,
+        turn_ms: int = 1,
+        change: Callable[[Machine], None] = lambda _machine: None,
+        port: Port | None = None,
+    ) -> None:
+        self.kind, self.turn_ms = kind, turn_ms
+        self.clock = VirtualClock()
+        changed = _ChangedMachine(change)
+        self.board = Board(self.clock, changed, port=port)
+        changed.board = self.board
+        self.body: Any = body_of(kind, self.board)
+        self.motors: list[tuple[float, tuple[float, float]]] = []
+        self.body.on_motors = lambda now, motors: self.motors.append((now, motors))
+        self.robot: Any = self.board.load(kind, {})
+        self.turns = self.damaged = 0
+        self._rest = b""
+
+    def turn(self, seconds: float) -> None:
+        for _ in range(round(1000 * seconds / self.turn_ms)):
+            self.turns += 1
+            self.clock.advance(self.turn_ms / 1000)
+            self.robot.step()
+            self.body.end_turn()
+
+    def send(self, line: bytes) -> None:
+        self.board.console.type(line + b"\n")
+
+    def read(self, data: bytes) -> list[Frame]:
+        """The whole frames in what the host has received by now; ``damaged`` counts what is none."""
+        *whole, self._rest = (self._rest + data).split(b"\0")
+        found = []
+        for raw in filter(None, whole):
+            try:
+                found.append(decode(raw))
+            except FrameError:
+                self.damaged += 1
+        return found
+
+    def frames(self, seconds: float = 0.2) -> list[Frame]:
+        """What the host reads during that time."""
+        self.turn(seconds)
+        return self.read(self.board.console.take_output())
+
+    def asked(self, kind: Type, payload: bytes = b"", *, interface: int = 0, sequence: int = 1) -> list[Frame]:
+        self.board.console.type(encode(Frame(kind, payload, interface=interface, sequence=sequence)))
+        return self.frames()
+
+    def manifest(self) -> Manifest:
+        return next(parse_describe(frame.payload) for frame in of(self.asked(Type.DESCRIBE_REQ), Type.DESCRIBE))
+
+
+def of(frames: Iterable[Frame], kind: Type) -> list[Frame]:
+    return [frame for frame in frames if frame.type is kind]
+
+
+# -- the board of Goob's inertial sensor, and the host's own code
+
+
+@pytest.fixture
+def imu() -> Bench:
+    return Bench("goob_imu", turn_ms=2)
+
+
+def test_half_a_frame_from_before_a_reset_does_not_swallow_its_hello(imu: Bench) -> None:
+    """On a serial port without USB, the host has no other sign that the firmware has changed."""
+    imu.turn(0.002)
+    frames = (encode(Frame(Type.SAMPLE, b"\1" * 18, 1))[:20] + imu.board.console.take_output()).split(b"\0")
+    assert Type.HELLO in [decode(one).type for one in frames[1:] if one]
+
+
+def test_what_it_measures(imu: Bench) -> None:
+    fast, slow = imu.manifest().interfaces
+    imu.body.imu.tilt_deg = (30.0, -20.0)
+    frames = imu.frames(4.0)
+    value = unpack(fast.fields, of(frames, Type.SAMPLE)[-1].payload)
+    assert value["roll_deg"] == pytest.approx(30.0, abs=1.0)
+    assert value["pitch_deg"] == pytest.approx(-20.0, abs=1.0)
+    assert [value[axis] for axis in ("gx", "gy", "gz")] == pytest.approx([0.0] * 3, abs=0.5)
+    assert 20.0 < value["temp_c"] < 32.0
+    assert value["az"] == pytest.approx(9.81 * 0.8138, abs=0.3)
+    state = unpack(slow.fields, of(frames, Type.STATE)[-1].payload)
+    assert state["accel_norm_g"] == pytest.approx(1.0, abs=0.03)
+    assert [state[f"gyro_bias_{axis}_dps"] for axis in "xyz"] == pytest.approx(imu.body.imu.bias_dps, abs=0.05)
+    assert (state["samples_error"], state["calibration_samples"]) == (0, 200)
+    assert state["samples_ok"] > 390
+    assert len(of(frames, Type.STATE)) in (19, 20, 21)
+
+
+@pytest.mark.parametrize(
+    ("kind", "interface", "number", "answer", "payload"),
+    [(Type.PING, 0, 0xDEADBEEF, Type.PONG, b""), (Type.CMD, 3, 9, Type.NACK, b"unknown_interface")],
+)
+def test_it_answers_with_the_number_of_the_question(
+    imu: Bench, kind: Type, interface: int, number: int, answer: Type, payload: bytes
+) -> None:
+    (found,) = of(imu.asked(kind, interface=interface, sequence=number), answer)
+    assert (found.payload, found.interface, found.sequence) == (payload, interface, number)
+
+
+def test_a_host_that_did_not_read_gets_the_number_of_lost_frames(imu: Bench) -> None:
+    frames = imu.frames(1.0)
+    imu.board.console.reading = False
+    imu.turn(3.0)
+    imu.board.console.reading = True
+    frames += imu.frames(1.0)
+    logs = [frame.payload for frame in of(frames, Type.LOG)]
+    (lost,) = [int(log.split(b"=")[1]) for log in logs if b"frames_lost=" in log]
+    received = len(of(frames, Type.SAMPLE)) + len(of(frames, Type.STATE))
+    messages = of(frames, Type.SAMPLE)[-1].sequence + of(frames, Type.STATE)[-1].sequence
+    assert lost > 200
+    assert messages - received - lost == imu.damaged
+    assert imu.damaged <= 1, "the one that was on its way"
+
+
+def test_it_describes_itself_when_asked_though_its_loop_is_slow_and_ctrl_c_is_a_byte_like_any_other() -> None:
+    """Every turn brings a sample then. The question begins with 3: it would stop the board."""
+    imu = Bench("goob_imu", turn_ms=12)
+    assert (ASK[0], imu.robot.ctrl_c) == (3, False)
+    imu.frames(0.3)
+    imu.board.console.type(b"\x03\x03\x00" + ASK)
+    frames = imu.frames(0.24)
+    assert [frame.type for frame in frames if frame.type in (Type.HELLO, Type.DESCRIBE)] == [Type.HELLO, Type.DESCRIBE]
+    assert len(of(frames, Type.SAMPLE)) >= 18
+    (described,) = of(frames, Type.DESCRIBE)
+    assert described.payload == MANIFEST
+    assert parse_describe(MANIFEST).hello == parse_hello(of(frames, Type.HELLO)[0].payload)
+
+
+def test_its_manifest_is_that_of_the_original_but_for_the_board() -> None:
+    ours, original = parse_describe(MANIFEST), parse_describe(IMU.describe())
+    rest = MANIFEST[49:]  # so long is HELLO, see robot.py
+    assert ours.hello.schema_hash == f"goob-imu-{crc16(rest, len(rest)):04x}", "it changes with the interfaces"
+    assert (ours.uid, ours.hello.model) == ("goob-imu", "seeed-xiao-samd21")
+    for one, other in zip(ours.interfaces, original.interfaces, strict=True):
+        fields = [replace(field, unit="") for field in one.fields]
+        assert fields == [replace(field, unit="") for field in other.fields]
+        assert replace(one, fields=()) == replace(other, fields=())
+
+
+# -- boards with motors
+
 
 KINDS = ("goob", "fred")
 STARTS = {"goob": 2, "fred": 4}  # pins of motors that come first: Goob's headlights take a timer channel between them
@@ -56,6 +224,40 @@ def test_the_motors_come_first(kind: str) -> None:
     assert pins.index(next(pin for pin in pins if pin not in motor_pins)) == STARTS[kind]
     assert all(bench.board.duty(pin) == 0.0 for pin in motor_pins)
     assert "ADC" not in [name for name, _ in touched[:4]]
+
+
+#: Volts at pins, the report of them, every how many milliseconds it comes, and other lines: the battery's in 5 s, too.
+REPORTS = {
+    "goob": (
+        {"PA02": 0.825, "PB09": 0.1, "PA11": 1.65, "PB08": 1.4},
+        b"T a0=512 a1=62 a2=1023",
+        20,
+        [b"Starting setup...", b"Done!", b"C chg=-1 v=8.100", b"C chg=-1 v=8.400"],
+    ),
+    "fred": (
+        {"PA02": 0.825, "PB08": 0.1, "PB09": 1.65},
+        b"T t0=512 t1=62 t2=1023 chg=0",
+        500,
+        [b"Starting setup...", b"Done!"],
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_it_reports_is_exactly_this(kind: str) -> None:
+    volts, report, period_ms, others = REPORTS[kind]
+    bench = Bench(kind)
+    for pin, level in volts.items():
+        bench.board.set_volts(pin, level)
+    if kind == "fred":
+        bench.board.set_pin("PA07", False)
+    lines: list[bytes] = []
+    for ms in range(1, 5010):
+        bench.turn(0.001)
+        came = bench.board.console.take_output().split(b"\r\n")[:-1]
+        assert (report in came) == (ms % period_ms == 0), ms
+        lines += [line for line in came if line != report]
+    assert lines == others
 
 
 def test_half_a_line_of_a_dead_host_moves_nothing(bench: Bench) -> None:
@@ -255,40 +457,3 @@ def test_the_imu_speaks_on_its_two_pins_and_keeps_up_with_its_slow_line() -> Non
     assert sequences == list(range(1, len(sequences) + 1))
     assert len(sequences) >= 296
     assert len(of(frames, Type.DESCRIBE)) == 1
-
-
-# -- the loop of every board
-
-
-class WasReset(BaseException):
-    """machine.reset() does not return."""
-
-
-def run(monkeypatch: pytest.MonkeyPatch, **errors: BaseException | type[BaseException]) -> list[Any]:
-    """Run the loop with a robot whose third step fails, and ``errors`` of ``stop`` or ``sleep_ms``; return calls."""
-    board = Mock()
-    board.micropython.const = int
-    board.robot.port = None
-    board.robot.step.side_effect = (None, None, MemoryError)
-    board.robot.stop.side_effect = errors.get("stop")
-    board.time.sleep_ms.side_effect = errors.get("sleep_ms")
-    board.machine.reset.side_effect = WasReset
-    for name in ("machine", "time", "micropython"):
-        monkeypatch.setitem(sys.modules, name, getattr(board, name))
-    loop = runpy.run_path(str(ROOT / "firmware" / "common" / "run.py"))
-    with pytest.raises(KeyboardInterrupt if "sleep_ms" in errors else WasReset):
-        loop["run"](lambda _settings: board.robot, {})
-    return [(name.rpartition(".")[2], *arguments) for name, arguments, _ in board.mock_calls]
-
-
-@pytest.mark.parametrize("errors", [{}, {"stop": MemoryError}])
-def test_a_robot_that_fails_stops_and_starts_anew_also_if_it_cannot_stop(
-    monkeypatch: pytest.MonkeyPatch, errors: dict[str, Any]
-) -> None:
-    calls = run(monkeypatch, **errors)
-    assert calls[:4] == [("kbd_intr", 3), ("sleep_ms", 1000), ("kbd_intr", -1), ("WDT",)], "Ctrl-C works until then"
-    assert calls[4:] == [("step",), ("feed",)] * 2 + [("step",), ("stop",), ("reset",)]
-
-
-def test_who_comes_in_by_that_door_finds_no_watchdog(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert ("WDT",) not in run(monkeypatch, sleep_ms=KeyboardInterrupt)
