@@ -21,7 +21,7 @@ from tests.robot.rig import Rig as RobotRig
 from tests.sparing_broker import SparingBroker
 from tests.support import Broker, beside, until
 from tests.transports.brokers import MAKERS, ROBOT, Maker, sparing_aedes
-from tests.transports.received import Received
+from tests.transports.net import Received
 
 pytestmark = [pytest.mark.alone, pytest.mark.thorough]  # deadlines are checked; make long PART=brokers runs it
 
