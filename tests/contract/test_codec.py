@@ -311,7 +311,6 @@ ENCODED: list[tuple[Channel, Any, bytes]] = [
     (c.AUDIO, bytearray(b"PBAT"), b"PBAT"),
     (c.ONLINE, Heartbeat(t=1, online=False), b'{"t":1,"online":false}'),
     (c.CHARGING_LEVEL, ChargingLevel(value=7.4), b'{"value":7.4,"unit":"v"}'),
-    (c.DRIVE, Drive(z=0.5), b'{"x":0.0,"z":0.5,"y":0.0}'),
     (c.DRIVE, SIGNED, b'{"x":-0.25,"z":0.625,"y":0.0,"source":"autonomy","run":1000000,"valid_ms":400}'),
     (c.SOUNDBOARD_COMMAND, SoundboardCommand(repeat=2), b'{"action":null,"enabled":null,"file":null,"repeat":2}'),
     (c.OUTLET_COMMAND, OutletCommand(on=True), b'{"on":true}'),
@@ -396,10 +395,7 @@ def judged(oracle: Callable[[Any], Any], raw: bytes) -> Any:
 
 
 def decoded(channel: Channel, raw: bytes) -> Any:
-    try:
-        value = codec.decode(channel, raw)
-    except PayloadError:
-        return REFUSED
+    value = decoded_exactly(channel, raw)
     if isinstance(value, Drive):
         return (value.x, value.z, value.y)
     return value.on if isinstance(value, OutletCommand) else value

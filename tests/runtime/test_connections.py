@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import os
 import subprocess
 from contextlib import ExitStack, closing
@@ -28,7 +27,7 @@ from pebble.transports import MqttSettings, create
 from pebble.transports.hosts import SMALL_SEGMENT
 from pebble.transports.topics import matches
 from tests.sparing_broker import SparingBroker
-from tests.support import ROOT, Broker, until
+from tests.support import Broker, until
 
 BASE = "pebble/robots/goob"
 
@@ -87,9 +86,6 @@ def test_a_live_stop_waits_for_none_that_a_broker_keeps(program: str, tmp_path: 
         assert sparing.segment <= SMALL_SEGMENT
 
 
-_STARTS = ("Popen", "run", "check_call", "check_output", "call")
-
-
 def test_the_launchers_variables_are_left_out_withheld_ones_are_empty_and_later_ones_win(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -101,18 +97,3 @@ def test_the_launchers_variables_are_left_out_withheld_ones_are_empty_and_later_
     assert "PEBBLE_NOTIFY_FD" not in variables
     assert subprocess.run(["printenv", "UPLINK"], capture_output=True, check=True).stdout == b"\n"
     assert "NOT_SET" not in os.environ
-
-
-def test_every_service_that_starts_a_program_chooses_its_environment() -> None:
-    starts = [
-        (path, call)
-        for path in (ROOT / "services").rglob("*.py")
-        for call in ast.walk(ast.parse(path.read_text()))
-        if isinstance(call, ast.Call) and ast.unparse(call.func) in {f"subprocess.{name}" for name in _STARTS}
-    ]
-    assert starts
-    assert [_place(path, call) for path, call in starts if "env" not in {word.arg for word in call.keywords}] == []
-
-
-def _place(path: Path, call: ast.Call) -> str:
-    return f"{path.relative_to(ROOT)}:{call.lineno}"

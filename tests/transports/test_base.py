@@ -217,10 +217,6 @@ def test_a_third_party_registers_through_an_entry_point(monkeypatch: pytest.Monk
     with create("theirs", "client", MemoryHub()) as transport:
         assert type(transport).__name__ == "TheirTransport"
         assert transport.state is State.CONNECTED
-
-
-def test_an_unknown_kind_names_the_known_ones(monkeypatch: pytest.MonkeyPatch) -> None:
-    install(monkeypatch, "tests.transports.test_base:TheirTransport")
     with pytest.raises(TransportError, match='no transport "carrier-pigeon": known are ') as refused:
         create("carrier-pigeon", "client", None)
     assert {"memory", "mqtt", "theirs", "zenoh"} <= set(str(refused.value).partition("known are ")[2].split(", "))

@@ -66,13 +66,6 @@ def check(filters: BrokerFilters, wanted: list[str]) -> None:
     assert needed <= frozenset().union(*(caught(filter_) for filter_ in filters))
 
 
-def test_the_same_filter_again_is_asked_for_again() -> None:
-    filters = BrokerFilters()
-    assert filters.add("a/#") == ("a/#", [])
-    assert filters.add("a/b") == ("a/#", [])
-    assert filters.add("+/b") == ("+/#", ["a/#"])
-
-
 def retained(payload: bytes, topic: str = "flag") -> Message:
     return Message(topic, payload, retain=True)
 
@@ -143,13 +136,6 @@ def test_every_topic_comes_back_and_no_two_share_a_key() -> None:
     keys = {topic_to_key(topic) for topic in topics}
     assert len(keys) == len(topics)
     assert {key_to_topic(key) for key in keys} == topics
-
-
-def test_keys_are_canonical_for_zenoh() -> None:
-    dice = random.Random(3)
-    for _ in range(500):
-        key = filter_to_key(random_filter(dice))
-        assert str(zenoh.KeyExpr.autocanonize(key)) == key
 
 
 @pytest.mark.parametrize("topic", ["pebble/robots/goob/incoming/drive-values", "Fred's lamp/über", "a-b_c.d"])

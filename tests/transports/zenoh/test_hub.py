@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from pebble.errors import TransportError
 from pebble.extensions.media.frames import FrameReader, FrameWriter
 from pebble.transports import QoS, ZenohSettings, create
-from pebble.transports.peers import FileLock, PeerRegistry, prepare_run_dir
+from pebble.transports.peers import PeerRegistry, prepare_run_dir
 from pebble.transports.zenoh import wire
 from pebble.transports.zenoh.callbacks import direct
 from pebble.transports.zenoh.hub import ZenohHub
@@ -300,16 +300,6 @@ def test_newcomers_are_connected_to_at_once_and_waited_for_when_ready(tmp_path: 
     first.release()
     second.release()
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_lock_has_one_owner_and_comes_back(tmp_path: Path) -> None:
-    first = FileLock.take(tmp_path / "lock")
-    assert first is not None
-    assert FileLock.take(tmp_path / "lock") is None
-    first.release()
-    again = FileLock.take(tmp_path / "lock")
-    assert again is not None
-    again.release()
 
 
 def test_a_socket_path_that_is_too_long_is_an_error_that_names_the_setting(tmp_path: Path) -> None:
