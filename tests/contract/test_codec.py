@@ -313,7 +313,6 @@ ENCODED: list[tuple[Channel, Any, bytes]] = [
     (c.CHARGING_LEVEL, ChargingLevel(value=7.4), b'{"value":7.4,"unit":"v"}'),
     (c.DRIVE, SIGNED, b'{"x":-0.25,"z":0.625,"y":0.0,"source":"autonomy","run":1000000,"valid_ms":400}'),
     (c.SOUNDBOARD_COMMAND, SoundboardCommand(repeat=2), b'{"action":null,"enabled":null,"file":null,"repeat":2}'),
-    (c.OUTLET_COMMAND, OutletCommand(on=True), b'{"on":true}'),
 ]
 
 

@@ -216,6 +216,34 @@ class TestReconciliation:
             given.append(resolution)
         assert given == [Resolution[name.upper()] for name in resolutions]
 
+    @pytest.mark.parametrize(
+        ("winner", "history", "side", "sent"),
+        [
+            (REMOTE, "L:a", REMOTE, ["a"]),  # a held copy fills what the winner does not know
+            (REMOTE, "L:a R:b to-L:b", REMOTE, []),
+            (REMOTE, "L:a R:b to-L:b", LOCAL, []),
+            (REMOTE, "r:new begin", REMOTE, ["new"]),  # a side that lost a value receives it
+            (REMOTE, "r:new begin R:new", REMOTE, []),
+            (LOCAL, "l:a to-R:a l:", REMOTE, [""]),  # and so does one that missed a removal
+            (REMOTE, "l:a l: begin", REMOTE, []),  # what was removed is not brought back
+        ],
+    )
+    def test_what_a_side_receives_when_it_is_there_again(
+        self, winner: Side, history: str, side: Side, sent: list[str]
+    ) -> None:
+        """to-L, to-R: what was published there. begin: the remote connection begins anew."""
+        reconciliation = Reconciliation(winner)
+        for word in history.split():
+            who, _, payload = word.partition(":")
+            place = REMOTE if who[-1] in "Rr" else LOCAL
+            if who == "begin":
+                reconciliation.begin(REMOTE)
+            elif who.startswith("to-"):
+                reconciliation.note_published(place, "t", payload.encode())
+            else:
+                reconciliation.receive(place, "t", payload.encode(), retained=who.isupper())
+        assert reconciliation.synchronize(side) == [(side, "t", payload.encode()) for payload in sent]
+
     @pytest.mark.parametrize(("size", "number"), [(1, 1024), (1 << 19, 40)])
     def test_its_memory_is_bounded_in_topics_and_in_bytes(
         self, monkeypatch: pytest.MonkeyPatch, size: int, number: int

@@ -99,8 +99,6 @@ class TestFlags:
             ("bridge", "start R:1 stop start", "1", "1", ""),
             ("mirror", "start R:1 stop start", "1", "1", "1"),
             *((each, "start L:1 R:", "", "", "1") for each in ("bridge", "mirror")),
-            *((each, "start L:1 L: remote-forgets", "", "", "1") for each in ("bridge", "mirror")),
-            ("mirror", "start L:1 cut L: mend", "", "", "1"),
         ],
     )
     def test_histories(self, make: Make, service: str, history: str, value: str, local: str, remote: str) -> None:

@@ -138,16 +138,14 @@ def test_every_topic_comes_back_and_no_two_share_a_key() -> None:
     assert {key_to_topic(key) for key in keys} == topics
 
 
-@pytest.mark.parametrize("topic", ["pebble/robots/goob/incoming/drive-values", "Fred's lamp/über", "a-b_c.d"])
-def test_ordinary_topics_are_their_own_keys(topic: str) -> None:
-    assert topic_to_key(topic) == topic
-
-
 @pytest.mark.parametrize(
     ("topic", "key"),
-    [("/a//b/", "%/a/%/b/%"), ("@a/@", "%40a/%40"), ("50%", "50%25"), ("$SYS/x", "@%24SYS/x"), ("a/$x", "a/%24x")],
+    [
+        *((same, same) for same in ("pebble/robots/goob/incoming/drive-values", "Fred's lamp/über", "a-b_c.d")),
+        *(("/a//b/", "%/a/%/b/%"), ("@a/@", "%40a/%40"), ("50%", "50%25"), ("$SYS/x", "@%24SYS/x"), ("a/$x", "a/%24x")),
+    ],
 )
-def test_what_zenoh_forbids_is_escaped(topic: str, key: str) -> None:
+def test_only_what_zenoh_forbids_is_escaped(topic: str, key: str) -> None:
     assert topic_to_key(topic) == key
 
 

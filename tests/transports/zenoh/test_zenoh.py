@@ -303,18 +303,6 @@ def test_two_robots_linked_by_tls_share_one_link_and_no_more(robot: ZenohNet, tm
         other.stop()
 
 
-def test_a_hub_that_reaches_another_one_says_what_is_lost(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    settings = [
-        ZenohSettings(run_dir=tmp_path / "a", listen=(endpoint,)),
-        ZenohSettings(run_dir=tmp_path / "b", connect=(endpoint,)),
-    ]
-    with contextlib.ExitStack() as stack:
-        for one in settings:
-            stack.callback(ZenohHub(one).open().close)
-        assert until(lambda: caplog.text.count("another hub is connected to this one") == 2)
-
-
 def test_only_certificates_with_an_allowed_name_get_through(tmp_path: Path) -> None:
     """The others have the same authority, and are connected."""
     endpoint = f"tls/localhost:{free_port()}"
