@@ -458,7 +458,7 @@ def test_a_handshake_may_take_long_while_bytes_arrive(tls_broker: Broker, goes_o
         with closing(Client(opening, Mock(), bridge=False)) as client:
             with nullcontext() if goes_on else pytest.raises(TimeoutError, match="TLS handshake"):
                 client.open()
-            assert time.monotonic() - began > patience_s
+            assert patience_s < time.monotonic() - began < 5
 
 
 @pytest.mark.parametrize(
