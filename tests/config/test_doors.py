@@ -76,13 +76,10 @@ def test_a_login_and_tls_are_needed_beyond_this_machine(
 @pytest.mark.parametrize(
     ("change", "refused"),
     [
-        ({}, []),
-        (at("services.mqtt_bridge.enabled", False), ["services.mqtt_bridge.enabled"]),
         (at(DRIVE, "x/y"), [DRIVE]),
         (at("services.mqtt_bridge.topics.reboot", "x/y"), ["services.mqtt_bridge.topics.reboot"]),
         (at("services.serial_mcu_bridge.topics.charging_level", "x/y"), []),
         (at(MIRROR, {"host": "broker.lab", **LOGIN}), ["transport.mqtt_mirror.host"]),
-        (at(MIRROR, {"host": "127.0.0.1"}), []),
         (deep_merge(MQTT, at("local_mqtt", {"host": "broker.lab", "port": 1884, **LOGIN})), ["local_mqtt.host"]),
         (deep_merge(MQTT, at("local_mqtt", {"host": "127.0.0.1"})), []),
         (deep_merge(MQTT, at(REMOTE, {"host": "localhost"})), [f"{REMOTE}.host"]),

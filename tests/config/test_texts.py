@@ -1,8 +1,7 @@
-"""Texts of a config: characters that are not seen, secrets in wrong places, and files in other encodings."""
+"""Texts of a config: characters that are not seen, hosts, secrets in wrong places, and files in other encodings."""
 
 from __future__ import annotations
 
-import ast
 import json
 import logging
 import os
@@ -13,31 +12,31 @@ from typing import Any
 
 import pytest
 
-from pebble.config import load
+from pebble.config import load, parse
+from pebble.config.hosts import HostError, broker_host, endpoint, name_of_page
+from pebble.config.raw import deep_merge
 from pebble.config.secret_text import without_secrets
 from pebble.config.visible import shown
-from pebble.errors import ConfigError
+from pebble.errors import ConfigError, PebbleError
+from pebble.extensions.fleet.certificates import init
+from pebble.extensions.operator.client.url import settings_of
 from pebble.runtime.parent import MaskingFormatter
+from pebble.services.video_stream.config import VideoStream
 from tests.commands.command_line import Run
+from tests.kit.configs import at
 from tests.support import ROOT, some
 
 SECRET = "s3cr3t"
 
 
 def config(place: str = "", value: Any = None) -> dict[str, Any]:
-    """A config that is right but for ``value`` at ``place``, whose levels stand between slashes."""
+    """A config that is right but for ``value`` at ``place``."""
     raw: dict[str, Any] = {
         "robot": {"id": "rover"},
         "transport": {"kind": "zenoh", "run_dir": "run", "state_dir": "state"},
         "services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "127.0.0.1", "port": 1}}},
     }
-    section = raw
-    *levels, last = place.split("/") if place else [""]
-    for level in levels:
-        section = section.setdefault(level, {})
-    if last:
-        section[last] = value
-    return raw
+    return deep_merge(raw, at(place, value)) if place else raw
 
 
 def problems(folder: Path, raw: Any) -> str:
@@ -56,12 +55,12 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
     return Run(monkeypatch, capsys)
 
 
-REMOTE = "services/mqtt_bridge/remote_mqtt"
+REMOTE = "services.mqtt_bridge.remote_mqtt"
 
 #: Characters that are not seen, and places where one is at an end of a text.
 UNSEEN = [*"\u200b\u00a0\ufeff\u202e\u3000\n\x00\x7f\u3164"]
-PLACES = ["robot/id", f"{REMOTE}/host", f"{REMOTE}/username", f"{REMOTE}/client_id"]
-ENDS = [*(("robot/id", char) for char in UNSEEN), *((place, "\u200b") for place in PLACES)]
+PLACES = ["robot.id", f"{REMOTE}.host", f"{REMOTE}.username", f"{REMOTE}.client_id"]
+ENDS = [*(("robot.id", char) for char in UNSEEN), *((place, "\u200b") for place in PLACES)]
 
 
 @pytest.mark.parametrize(
@@ -71,31 +70,31 @@ ENDS = [*(("robot/id", char) for char in UNSEEN), *((place, "\u200b") for place 
 def test_a_character_that_is_not_seen_is_named_by_its_code(tmp_path: Path, place: str, char: str, named: str) -> None:
     for text in (f"a{char}", f"{char}a"):
         found = problems(tmp_path, config(place, text))
-        assert place.replace("/", ".") in found
+        assert place in found
         assert named in found
 
 
 @pytest.mark.parametrize(("name", "way_out"), [("ba\u0308r", '"b\\u00e4r"'), ("..", "write another"), ("bär", "")])
 def test_a_name_that_nobody_can_type_is_refused_with_what_to_write(tmp_path: Path, name: str, way_out: str) -> None:
-    found = problems(tmp_path, config("robot/type", name))
+    found = problems(tmp_path, config("robot.type", name))
     assert ("robot.type: " in found, found.count("\n"), way_out in found) == (bool(way_out), 0, True)
 
 
 #: Where people put a login or a password that does not belong there.
 LOGINS = {
-    "a URL as host": (f"{REMOTE}/host", f"mqtt://rover:{SECRET}@192.0.2.7:1883"),
-    "an @ in the password": (f"{REMOTE}/host", f"mqtt://rover:p@{SECRET}@192.0.2.7"),
-    "a slash in the password": (f"{REMOTE}/host", f"mqtt://rover:p/{SECRET}@192.0.2.7"),
-    "percent-encoded": (f"{REMOTE}/host", f"mqtt%3A%2F%2Frover%3A{SECRET}%40192.0.2.7"),
-    "a port": (f"{REMOTE}/port", f"1883:{SECRET}"),
-    "a misspelt key": (f"{REMOTE}/passwrod", SECRET),
-    "a list": (f"{REMOTE}/password", [SECRET]),
-    "a file's name": (f"{REMOTE}/password_file", SECRET),
-    "a user": (f"{REMOTE}/username", f"rover:{SECRET}"),
-    "a Zenoh endpoint": ("transport/connect", [f"tls/u:{SECRET}@h:7447"]),
-    "an unknown key": (f"{REMOTE}/mqtt://u:{SECRET}@h", 1),
-    "a topic": ("services/serial_mcu_bridge", {"topics": {"drive": f"mqtt://u:{SECRET}@h/x"}}),
-    "a video address": ("services/video_stream", {"webrtc_url": f"http://u:{SECRET}@h/x"}),
+    "a URL as host": (f"{REMOTE}.host", f"mqtt://rover:{SECRET}@192.0.2.7:1883"),
+    "an @ in the password": (f"{REMOTE}.host", f"mqtt://rover:p@{SECRET}@192.0.2.7"),
+    "a slash in the password": (f"{REMOTE}.host", f"mqtt://rover:p/{SECRET}@192.0.2.7"),
+    "percent-encoded": (f"{REMOTE}.host", f"mqtt%3A%2F%2Frover%3A{SECRET}%40192.0.2.7"),
+    "a port": (f"{REMOTE}.port", f"1883:{SECRET}"),
+    "a misspelt key": (f"{REMOTE}.passwrod", SECRET),
+    "a list": (f"{REMOTE}.password", [SECRET]),
+    "a file's name": (f"{REMOTE}.password_file", SECRET),
+    "a user": (f"{REMOTE}.username", f"rover:{SECRET}"),
+    "a Zenoh endpoint": ("transport.connect", [f"tls/u:{SECRET}@h:7447"]),
+    "an unknown key": (f"{REMOTE}.mqtt://u:{SECRET}@h", 1),
+    "a topic": ("services.serial_mcu_bridge", {"topics": {"drive": f"mqtt://u:{SECRET}@h/x"}}),
+    "a video address": ("services.video_stream", {"webrtc_url": f"http://u:{SECRET}@h/x"}),
 }
 
 
@@ -174,28 +173,10 @@ def test_a_file_in_another_encoding_is_understood_or_named(tmp_path: Path, run: 
 
 def test_every_text_file_of_the_product_is_read_as_utf_8() -> None:
     """No file is read in another encoding, whatever the locale is."""
-    wrong = [
-        f"{path.relative_to(ROOT)}:{call.lineno}"
-        for folder in ("pebble", "transports", "services")
-        for path in sorted((ROOT / folder).rglob("*.py"))
-        if not {"bench", "firmware", "rig"} & {*path.parts}
-        if "open(" in (text := path.read_text(encoding="utf-8")) or "_text(" in text
-        for call in ast.walk(ast.parse(text))
-        if isinstance(call, ast.Call) and _is_text(call) and "encoding" not in [one.arg for one in call.keywords]
-    ]
-    assert wrong == []
-
-
-def _is_text(call: ast.Call) -> bool:
-    """Whether the call opens a text file."""
-    if isinstance(call.func, ast.Attribute) and call.func.attr in ("read_text", "write_text"):
-        return not (isinstance(call.func.value, ast.Name) and call.func.value.id == "text_files")
-    name = getattr(call.func, "id", None) or getattr(call.func, "attr", None)
-    modes = [
-        one.value for one in (*call.args[:2], *(key.value for key in call.keywords)) if isinstance(one, ast.Constant)
-    ]
-    is_file = isinstance(call.func, ast.Name) or (isinstance(call.func, ast.Attribute) and len(call.args) == 0)
-    return name == "open" and is_file and any(mode in ("r", "w", "a", "x", "r+", "w+") for mode in modes)
+    rule = ["--isolated", "--preview", "--select=PLW1514", "--exclude=bench,firmware,rig"]
+    command = [sys.executable, "-m", "ruff", "check", *rule, "pebble", "services", "transports"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 0, done.stdout
 
 
 @pytest.mark.parametrize(
@@ -218,3 +199,91 @@ def test_invisible_and_steering_characters_are_shown_as_codes(text: str, seen: s
     assert shown(f"x {text}") == f"x {seen}"
     record = logging.LogRecord("a", logging.INFO, "", 0, "%s", (text,), None)
     assert MaskingFormatter("%(message)s").format(record) == seen
+
+
+@pytest.mark.parametrize(
+    ("text", "host"),
+    [
+        *((same, same) for same in ("broker.example", "mqtt_broker", "7up", "192.0.2.7", "::1", "fe80::1%eth0", "::")),
+        ("Broker.LAN.", "Broker.LAN"),
+        ("[::1]", "::1"),
+        *((same, "fe80::1%eth0.5") for same in ("fe80::1%25eth0.5", "[fe80::1%25eth0.5]", "[FE80::1%25eth0%2E5]")),
+        ("bröker.example", "xn--brker-kua.example"),
+        ("bro\u0308ker.example", "xn--brker-kua.example"),
+    ],
+)
+def test_hosts_are_understood(text: str, host: str) -> None:
+    assert broker_host(text) == host
+
+
+@pytest.mark.parametrize(
+    ("text", "instead"),
+    [
+        *((text, "must be a name or a whole address, such as") for text in (
+            "mqtt://broker.example", "b:1883", "[b]", "[::1]:1883", "b/", "mqtt://u:s3/cr3t@b", "1883:s3cr3t", "1.2.3",
+            "999.1.1.1", "2130706433", "0x7f.1", "010.0.0.1", "a b", "a..b", "-a", "", "u" * 64, "u." * 130, "a,b",
+            "fe80::1%", "straße.example", "\uff11\uff12\uff17.0.0.1",
+        )),
+        ("fe80::1", 'names no network card: write "fe80::1%eth0"'),
+        *((text, "starts or ends with a blank") for text in ("b ", " b")),
+        *((f"b{char}", f"holds U+{ord(char):04X}, which is not shown") for char in "\t\n\0\u200b"),
+    ],
+)  # fmt: skip
+def test_other_texts_are_refused_with_what_to_write(text: str, instead: str) -> None:
+    with pytest.raises(HostError) as caught:
+        broker_host(text)
+    assert str(caught.value).startswith(instead)
+    assert str(caught.value).isprintable()
+    assert "cr3t" not in str(caught.value)
+
+
+BAD = "mqtts://rover:s3cr3t@broker.example:8883"
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        *((f"{section}.host", BAD) for section in ("local_mqtt", "transport.mqtt_mirror", "web_interface.mqtt",
+                                                   "services.mqtt_bridge.remote_mqtt", "web_interface")),
+        ("web_interface.names", [BAD]),
+        ("transport.listen", ["tls/rover:s3cr3t@0.0.0.0:7447"]),
+    ],
+)  # fmt: skip
+def test_every_key_that_names_a_host_reads_it_so(place: str, value: object) -> None:
+    raw = {"robot": {"id": "rover"}, "transport": {"kind": "zenoh"}}
+    with pytest.raises(ConfigError) as caught:
+        parse(deep_merge(raw, at(place, value)), folder=Path("/"), env={})
+    assert str(caught.value).startswith(place)
+    assert "s3cr3t" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "url",
+    ["mqtt://rover:s3cr3t@b", "mqtt://rover:s3cr3t", "mqtt://bro\nker", "mqtt://u:s3cr3t@[::1", "tcp://u:s3cr3t@b"],
+)
+def test_so_does_the_command_line(url: str, tmp_path: Path) -> None:
+    for read in (settings_of, lambda text: init(tmp_path, [text])):
+        with pytest.raises(PebbleError) as caught:
+            read(url)
+        assert "cr3t" not in str(caught.value)
+
+
+def test_endpoints_and_names_of_the_page() -> None:
+    for text in ("tcp/0.0.0.0:0", "tls/[::]:7447?rel=1", "udp/224.0.0.224:7446#iface=eth0", "serial//dev/ttyUSB0"):
+        assert endpoint(text) == text
+    assert [name_of_page(name) for name in ("Fair.local:8443", "fair.local.")] == ["fair.local:8443", "fair.local"]
+
+
+@pytest.mark.parametrize(
+    ("url", "public", "warned"),
+    [
+        ("https://me:s3/cr3t@pit:88/x", "https://pit:88/x", "its login is left out"),
+        ("http://pit,b/x", "http://pit,b/x", "no page can show it"),
+        ("/whep", "/whep", ""),
+    ],
+)
+def test_the_address_of_a_stream(url: str, public: str, warned: str) -> None:
+    config = parse({"robot": {"id": "r"}, "services": {"video_stream": {"webrtc_url": url}}}, folder=Path("/"), env={})
+    assert config.section(VideoStream).webrtc_url == public
+    assert warned in "".join(config.warnings)
+    assert bool(warned) == bool(config.warnings)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import random
 import stat
 from collections.abc import Callable
 from pathlib import Path
@@ -100,16 +99,6 @@ def test_commands_run_from_the_active_slot_or_the_one_that_is_whole(tmp_path: Pa
     assert slots.run("which").stdout == f"{tmp_path}/opt/pebble/a\n"
     (Places(tmp_path).slots / "a" / ".complete").unlink()
     assert slots.run("which").returncode == 1
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_random_bytes_as_a_trial_never_start_another_slot(tmp_path: Path, seed: int) -> None:
-    generator = random.Random(seed)
-    slots = Slots(tmp_path)
-    torn = f"{TRIAL}\n".encode()[: generator.randrange(24)]
-    slots.trial.write_bytes(generator.choice([generator.randbytes(generator.randrange(400)), torn]))
-    assert slots.run("choose").returncode == 0
-    assert slots.seen() == Seen("a", "a", "", "")
 
 
 def test_what_it_makes_can_be_read_by_the_robots_user(tmp_path: Path) -> None:

@@ -75,16 +75,7 @@ SOUNDS: dict[bytes, dict[str, Any]] = {
 MEANINGS: list[tuple[Channel, bytes, Any]] = [
     # white space may follow a value: a bridge's probe on a flag's topic is the flag's value
     (c.MQTT_VIDEO, b'{"value": true}' + b" \t\n" * 8, True),
-    (c.MQTT_VIDEO, b'{"value": false, "enabled": true}', False),
-    # drive values: bare or wrapped numbers, or numeric strings
-    (c.DRIVE, b'{"x": 0.2, "z": 0.5}', Drive(x=0.2, z=0.5)),
-    (c.DRIVE, b'{"x": 0.2, "z": 0.5, "y": -1}', Drive(x=0.2, z=0.5, y=-1)),
-    (c.DRIVE, b"{}", Drive()),
-    (c.DRIVE, b'{"x": "0.25", "z": " -1e-1 "}', Drive(x=0.25, z=-0.1)),
-    (c.DRIVE, b'{"value": {"x": 1}, "x": -1, "z": 1}', Drive(x=1)),
-    (c.DRIVE, b'{"value": null, "x": 0.5}', Drive(x=0.5)),
-    (c.DRIVE, b'{"x": 7, "z": -7, "y": "1e9"}', Drive(x=1, z=-1, y=1)),
-    (c.DRIVE, b'{"x": -1, "x": 1}', Drive(x=1)),
+    # drive values, whose numbers an independent reader reads below
     (c.DRIVE, b'{"x": 1, "t": 1710969600123, "origin": {"a": [1]}}', Drive(x=1, t=1710969600123)),
     # their source, their run, and how long they are valid
     (c.DRIVE, b'{"z": 1, "source": "autonomy", "run": 17}', Drive(z=1, source="autonomy", run=17)),
@@ -107,7 +98,6 @@ MEANINGS: list[tuple[Channel, bytes, Any]] = [
     *((c.SOUNDBOARD_COMMAND, raw, SoundboardCommand(**fields)) for raw, fields in SOUNDS.items()),
     (c.AUTONOMY_COMMAND, FOLLOW, FOLLOWS),
     (c.AUTONOMY_COMMAND, b'{"value": ' + FOLLOW + b"}", FOLLOWS),
-    (c.OUTLET_COMMAND, b'{"value": {"on": false}}', OutletCommand(on=False)),
     (c.ESTOP_RESET, b'{"boot": "a1b2c3d4", "count": 3}', EstopReset(boot="a1b2c3d4", count=3)),
     (c.AUDIO_STREAM, b"PBAT\xff\x00", b"PBAT\xff\x00"),  # it is not looked into
 ]
@@ -120,15 +110,13 @@ def test_a_payload_has_its_value(channel: Channel, raw: bytes, value: Any) -> No
 
 #: Payloads that mean nothing.
 REFUSALS: dict[Channel, list[bytes]] = {
-    c.REBOOT: [b"1", b'"true"', b"{}", b'{"value": 1}', b'{"enabled": "on"}', b'{"value": {"value": true}}', b""],
-    c.DRIVE: [b"", b"null", b"[]", b"1", b'{"x": 1', b'{"x": 1}}'],
+    c.DRIVE: [b"", b"[]", b'{"x": 1}}'],
     c.LIGHTS_FLASH: [b'{"period": 1e999}', b'{"b": 1, "period": "inf"}', b"[1, 1, 1]", b'"1"'],
     c.SOUNDBOARD_COMMAND: [
         *(b'{"action": "play", "file": "a", "repeat": ' + number + b"}" for number in (b"-1", b'"yes"', b"0.5", b"[]")),
         *NO_SWITCH,
     ],
     c.AUTONOMY_COMMAND: NO_SWITCH,
-    c.OUTLET_COMMAND: [b'{"on": "false"}', b'{"on": 1}', b'{"on": null}', b"{}", b"true"],
     c.ESTOP: [b""],
     c.ESTOP_RESET: [b"", b"{}", b'{"boot": "a"}', b'{"boot": 1, "count": 1}', b'{"boot": "a", "count": true}'],
     c.CONTROL: [
@@ -144,13 +132,6 @@ def test_a_payload_without_a_value_is_refused(channel: Channel, raw: bytes) -> N
 
 
 # -- boolean controls
-
-
-@pytest.mark.parametrize("channel", BOOLEANS, ids=lambda channel: channel.metric)
-def test_a_boolean_control_has_three_forms(channel: Channel) -> None:
-    for form in ("{}", '{{"value": {}}}', '{{"enabled": {}}}', '{{"value": 1, "enabled": {}}}'):
-        assert codec.decode(channel, form.format("true").encode()) is True
-        assert codec.decode(channel, form.format("false").encode()) is False
 
 
 # -- drive values
@@ -330,10 +311,8 @@ ENCODED: list[tuple[Channel, Any, bytes]] = [
     (c.AUDIO, bytearray(b"PBAT"), b"PBAT"),
     (c.ONLINE, Heartbeat(t=1, online=False), b'{"t":1,"online":false}'),
     (c.CHARGING_LEVEL, ChargingLevel(value=7.4), b'{"value":7.4,"unit":"v"}'),
-    (c.DRIVE, Drive(z=0.5), b'{"x":0.0,"z":0.5,"y":0.0}'),
     (c.DRIVE, SIGNED, b'{"x":-0.25,"z":0.625,"y":0.0,"source":"autonomy","run":1000000,"valid_ms":400}'),
     (c.SOUNDBOARD_COMMAND, SoundboardCommand(repeat=2), b'{"action":null,"enabled":null,"file":null,"repeat":2}'),
-    (c.OUTLET_COMMAND, OutletCommand(on=True), b'{"on":true}'),
 ]
 
 
@@ -415,10 +394,7 @@ def judged(oracle: Callable[[Any], Any], raw: bytes) -> Any:
 
 
 def decoded(channel: Channel, raw: bytes) -> Any:
-    try:
-        value = codec.decode(channel, raw)
-    except PayloadError:
-        return REFUSED
+    value = decoded_exactly(channel, raw)
     if isinstance(value, Drive):
         return (value.x, value.z, value.y)
     return value.on if isinstance(value, OutletCommand) else value

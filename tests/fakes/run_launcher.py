@@ -3,7 +3,7 @@
 TABLE is JSON: a list of [name, module, arguments, stage], perhaps with an object of a program's other properties.
 Messages are written to RECORD. Options: those of fake_announcer, ``hasty`` (2 s without a sign of life is stuck),
 ``signal`` (a stop signal comes while the first child is being started), ``tireless`` (nothing is a crash loop),
-``forgetful`` (requests of an ended program expire after 1 s), ``missing`` (one more program, which does not exist),
+``forgetful`` (requests of an ended program expire after 1 s),
 ``deny CALL ERRNO`` (the kernel refuses this system call, as in a container).
 """
 
@@ -41,8 +41,6 @@ if "tireless" in options:
     restart_policy.LOOP_WINDOW_S = 0.0
 if "forgetful" in options:
     on_demand.OUTLIVE_S = 1.0
-if "missing" in options:
-    table.append(Program("missing", "no_such_module", (), Stage.CONNECTION))
 for option in options:
     if option.startswith("deny "):
         deny(*option.split()[1:])

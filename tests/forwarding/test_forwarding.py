@@ -344,26 +344,23 @@ class TestEventBuffer:
 class TestGate:
     """An event that arrives while the gate opens or shuts: what was waiting may have been sent, or cleared, already."""
 
-    def receive(self, forwarder: Forwarder, monkeypatch: pytest.MonkeyPatch, change: Callable[[], None]) -> None:
-        """Receive an event, and ``change`` the gate just before it waits."""
+    @pytest.mark.parametrize(("change", "sent"), [(Forwarder.open, [b"1"]), (Forwarder.shut, [])])
+    def test_it_is_sent_at_once_or_never(
+        self,
+        waiting: Forwarder,
+        remote: Wire,
+        monkeypatch: pytest.MonkeyPatch,
+        change: Callable[[Forwarder], None],
+        sent: list[bytes],
+    ) -> None:
+        """The gate changes just before the event waits."""
         hold = EventBuffer.hold
-
-        def hold_late(events: EventBuffer, message: Message) -> None:
-            change()
-            hold(events, message)
-
-        monkeypatch.setattr(EventBuffer, "hold", hold_late)
-        forwarder.receive(LOCAL, Message(f"{BASE}/outgoing/weather", b"1", QoS.DELIVERED))
-
-    def test_it_is_sent(self, waiting: Forwarder, remote: Wire, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.receive(waiting, monkeypatch, waiting.open)
-        assert remote.sent == [b"1"]
-
-    def test_it_is_not_sent_later(self, waiting: Forwarder, remote: Wire, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.receive(waiting, monkeypatch, waiting.shut)
+        monkeypatch.setattr(EventBuffer, "hold", lambda *event: (change(waiting), hold(*event)))
+        waiting.receive(LOCAL, Message(f"{BASE}/outgoing/weather", b"1", QoS.DELIVERED))
+        assert remote.sent == sent
         waiting.rearm()
         waiting.open()
-        assert remote.sent == []
+        assert remote.sent == sent
 
 
 class TestLate:

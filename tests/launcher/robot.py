@@ -105,7 +105,7 @@ def _config(run_dir: Path, launcher: dict[str, Any]) -> dict[str, Any]:
         "transport": {"kind": "mqtt", "run_dir": str(run_dir)},
         "local_mqtt": {"password": "hush"},
         "services": {
-            "defaults": {"retained_publish_interval_seconds": launcher.pop("republish_s", 3600)},
+            "defaults": {"retained_publish_interval_seconds": 3600},
             "launcher": launcher,
         },
     }

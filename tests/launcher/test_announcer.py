@@ -1,6 +1,9 @@
+"""What the launcher publishes: states and records by its announcer, and lines of its children."""
+
 from __future__ import annotations
 
 import json
+import logging
 import os
 import threading
 from collections.abc import Callable, Iterator
@@ -9,8 +12,11 @@ from typing import Any
 
 import pytest
 
+from pebble.contract.payloads import LogRecord
+from pebble.launcher import log_forwarding
 from pebble.launcher.announcer import Announcer
 from pebble.launcher.announcer_pipe import ENVELOPE_LIMIT, AnnouncerPipe, Envelope, next_envelope
+from pebble.launcher.log_forwarding import LevelReader, LogForwarder, NonBlockingWriter, OwnRecords, text_of
 from pebble.launcher.reactor import Reactor
 from pebble.runtime.parent import Notifier
 from pebble.transports import Message, QoS, State
@@ -165,19 +171,6 @@ def connection() -> Iterator[Connection]:
     connection.close()
 
 
-def test_messages_arrive_as_they_were_and_then_the_end_of_the_pipe(connection: Connection) -> None:
-    connection.connect()
-    assert connection.next() == Envelope("will", WILL)
-    sent = Message("a/b", b"\x00\xff", QoS.LATEST)
-    connection.pipe.record(sent)
-    envelope = connection.next()
-    assert envelope == Envelope("record", sent)
-    assert envelope is not None
-    assert isinstance(envelope.message.qos, QoS)
-    connection.pipe.close()
-    assert connection.next() is None
-
-
 def test_a_new_announcer_receives_the_will_and_the_present_states_first(connection: Connection) -> None:
     connection.pipe.state(Message("a", b"old"))
     connection.pipe.state(Message("a", b"new"))
@@ -209,3 +202,159 @@ def test_states_are_not_lost_to_a_flood_of_records(connection: Connection) -> No
     received: list[tuple[str, bytes]] = []
     assert connection.reactor.run_until(lambda: bool(received.extend(connection.received()) or received), 5)
     assert received == [("state", b"new")]
+
+
+class Forwarded:
+    """A forwarder whose stderr is a pipe."""
+
+    def __init__(self) -> None:
+        self.read_end, self.write_end = os.pipe2(os.O_NONBLOCK)
+        self.records: list[LogRecord] = []
+        self.forwarder = LogForwarder(self.records.append, stderr=self.write_end)
+
+    def written(self) -> str:
+        try:
+            return os.read(self.read_end, 65536).decode()
+        except BlockingIOError:
+            return ""
+
+    def close(self) -> None:
+        os.close(self.read_end)
+        os.close(self.write_end)
+
+
+@pytest.fixture
+def forwarded(monkeypatch: pytest.MonkeyPatch) -> Iterator[Forwarded]:
+    monkeypatch.setattr(log_forwarding, "_LEAST", log_forwarding.LEVELS.index("WARNING"))
+    made = Forwarded()
+    yield made
+    made.close()
+
+
+@pytest.mark.parametrize(
+    ("line", "published", "message"),
+    [
+        ("[ERROR] " + "y" * 2044, True, "[x] " + "y" * 2044),
+        ("[ERROR] " + "y" * 2045, True, "[x] " + "y" * 2041 + "..."),
+        ("[INFO] routine", True, None),  # below the least level
+        ("[ERROR] broken pipe", False, None),  # of the process that publishes
+    ],
+)
+def test_a_childs_line_is_written_and_published_under_its_name(
+    forwarded: Forwarded, line: str, published: bool, message: str | None
+) -> None:
+    forwarded.forwarder.child_line("x", 42, f"12:00:00 {line}", published=published)
+    assert line.split()[1] in forwarded.written()
+    found = [(record.level, record.service, record.message, record.pid) for record in forwarded.records]
+    assert found == ([] if message is None else [("ERROR", "x", message, 42)])
+    assert all(record.t > 1_600_000_000_000 and record.logger == "root" for record in forwarded.records)
+
+
+def test_children_do_not_share_a_traceback(forwarded: Forwarded) -> None:
+    forwarded.forwarder.child_line("a", 1, "Traceback (most recent call last):")
+    forwarded.forwarder.child_line("b", 2, "fine")
+    forwarded.forwarder.child_line("a", 1, "ValueError")
+    forwarded.forwarder.child_line("a", 3, "a fresh start")
+    assert [(record.service, record.pid) for record in forwarded.records] == [("a", 1), ("a", 1)]
+
+
+def test_a_tagged_line_is_logged_under_the_name_in_its_tag(forwarded: Forwarded) -> None:
+    for line in (
+        "[tag-follow 7] 12:00:00 [ERROR] no camera",
+        "[tag-follow 7]   at line 3",
+        "[tag-follow 8] fine",
+        "12:00:00 [WARNING] tag-follow exited with code 3",
+        "[no tag] fine",
+        "[tag-follow 8]  ",
+    ):
+        forwarded.forwarder.tagged_line("autonomy_manager", 42, line)
+    records = [(record.service, record.pid, record.level, record.message) for record in forwarded.records]
+    assert records == [
+        ("autonomy_manager:tag-follow", 7, "ERROR", "[autonomy_manager:tag-follow] no camera"),
+        ("autonomy_manager:tag-follow", 7, "ERROR", "[autonomy_manager:tag-follow]   at line 3"),
+        ("autonomy_manager", 42, "WARNING", "[autonomy_manager] tag-follow exited with code 3"),
+    ]
+    assert "[INFO] [autonomy_manager:tag-follow] fine" in forwarded.written()
+
+
+def test_the_launchers_own_records_go_the_same_way(forwarded: Forwarded) -> None:
+    log = logging.getLogger("pebble.launcher.process_supervisor")
+    with OwnRecords(forwarded.forwarder, "INFO"):
+        log.info("quiet")
+        log.debug("not even written")
+        log.log(35, "between the levels")
+        log.warning("it broke", exc_info=ValueError("seven"))
+    log.warning("after the end")
+    found = [(one.level, one.pid, one.logger, one.message.partition("\n")[0]) for one in forwarded.records]
+    expected = [("WARNING", text) for text in ("[launcher] between the levels", "[launcher] it broke")]
+    assert found == [(level, os.getpid(), log.name, text) for level, text in expected]
+    written = [line.partition(" ")[2] for line in forwarded.written().splitlines()]
+    assert written[:2] == ["[INFO] [launcher] quiet", "[WARNING] [launcher] between the levels"]
+    assert written[-1] == "[WARNING] [launcher] ValueError: seven"
+
+
+def test_writing_never_waits_for_a_reader() -> None:
+    read_end, write_end = os.pipe()  # blocking, as a terminal is
+    try:
+        writer = NonBlockingWriter(write_end)
+        for _ in range(1000):
+            writer.write("x" * 1000)
+        assert writer.dropped > 0
+        os.close(read_end)
+        dropped = writer.dropped
+        writer.write("the reader has gone")
+        assert writer.dropped == dropped + 1
+    finally:
+        os.close(write_end)
+
+
+# -- levels
+
+
+@pytest.mark.parametrize(
+    ("line", "text"),
+    [
+        (b"  three  ", "  three"),
+        (b"\x1b[2Jgone\x07 \xe2\x80\xae.\r\n", "\\u001b[2Jgone\\u0007 \\u202e."),  # it does not steer a terminal
+        (b"a\xff\xfeb", "a\ufffd\ufffdb"),
+    ],
+)
+def test_a_line_becomes_text(line: bytes, text: str) -> None:
+    assert text_of(line) == text
+
+
+@pytest.mark.parametrize(
+    ("line", "level", "text"),
+    [
+        ("12:00:00 [WARN] hello", "WARNING", "hello"),
+        ("12:00:00,123 [FATAL] [x] y", "CRITICAL", "[x] y"),
+        ("12:00:00 [DEBUG] ", "DEBUG", ""),
+        ("12:00:00 [SHOUT] hello", "INFO", "12:00:00 [SHOUT] hello"),
+        ("12:00 [ERROR] hello", "INFO", "12:00 [ERROR] hello"),
+    ],
+)
+def test_a_line_of_the_log_format_names_its_level(line: str, level: str, text: str) -> None:
+    assert LevelReader().read(line) == (level, text)
+
+
+#: Lines, and the first letter of the level that each has.
+LINES = {
+    "a traceback has the level of the line it belongs to": (
+        ("12:00:00 [WARNING] it broke", "W"),
+        *(("Traceback (most recent call last):", "W"), ("ValueError: no", "W"), ("12:00:01 [INFO] goes on", "I")),
+        ("a print", "I"),
+    ),
+    "one of its own is an error": (
+        *(("a print", "I"), ("Traceback (most recent call last):", "E"), ("  File", "E"), ("ImportError: no", "E")),
+    ),
+    "indented lines continue, and others do not": (
+        *(("12:00:00 [ERROR] two reasons:", "E"), ("  one", "E"), ("  two", "E")),
+        *(("a print", "I"), ("  of its own", "I")),
+    ),
+}
+
+
+@pytest.mark.parametrize("lines", LINES.values(), ids=LINES)
+def test_the_levels_of_several_lines(lines: tuple[tuple[str, str], ...]) -> None:
+    reader = LevelReader()
+    assert [(line, reader.read(line)[0][0]) for line, _ in lines] == [*lines]

@@ -154,14 +154,12 @@ def test_a_starting_program_begins_again_with_the_newest_request(state: str, rel
     "line",
     [
         "",
-        "{}",
         '{"note":"wanted","program":"media","on":2}',
         '{"note":"wanted","program":"media","on":true,"encoding":"H264"}',
         '{"note":"feature","name":"drive","has":true}',
         '{"note":"feature","name":"estop\\n","has":true}',
         '{"note":"feature","name":"outlets/a/b","has":true}',
         '{"note":"mcu","state":"well","silent_ms":0}',
-        '{"note":"local","connected":"1"}',
     ],
 )
 def test_nonsense_is_no_note(line: str) -> None:

@@ -1,7 +1,11 @@
-"""What a robot's connections are set up with."""
+"""What a robot's connections and the programs that it starts are set up with, and how its files are written."""
 
 from __future__ import annotations
 
+import errno
+import os
+import stat
+import subprocess
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
@@ -11,6 +15,7 @@ import pytest
 
 from pebble.config import parse
 from pebble.contract import ESTOP
+from pebble.errors import PebbleError
 from pebble.extensions.fleet.gateway.connections import gateway_transports
 from pebble.extensions.fleet.gateway.gateway import will
 from pebble.extensions.fleet.gateway.gateway_file import GatewayFile
@@ -20,11 +25,13 @@ from pebble.runtime.connections import (
     remote_transport,
     stops_transport,
 )
+from pebble.runtime.environment import child_environment, withhold
+from pebble.runtime.whole_file import write
 from pebble.transports import MqttSettings, create
 from pebble.transports.hosts import SMALL_SEGMENT
 from pebble.transports.topics import matches
 from tests.sparing_broker import SparingBroker
-from tests.support import Broker, until
+from tests.support import Broker, refused, until
 
 BASE = "pebble/robots/goob"
 
@@ -81,3 +88,57 @@ def test_a_live_stop_waits_for_none_that_a_broker_keeps(program: str, tmp_path: 
         sender.publish(topic, b"stop")
         assert until(lambda: received == [b"stop"])
         assert sparing.segment <= SMALL_SEGMENT
+
+
+def test_the_launchers_variables_are_left_out_withheld_ones_are_empty_and_later_ones_win(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name, value in (("UPLINK", "topsecret"), ("PEBBLE_NOTIFY_FD", "3"), ("MARK", "inherited")):
+        monkeypatch.setenv(name, value)
+    withhold(["UPLINK", "NOT_SET"])
+    variables = child_environment({"MARK": "first"}, {"MARK": "second"})
+    assert (variables["MARK"], variables["UPLINK"], variables["PATH"]) == ("second", "", os.environ["PATH"])
+    assert "PEBBLE_NOTIFY_FD" not in variables
+    assert subprocess.run(["printenv", "UPLINK"], capture_output=True, check=True).stdout == b"\n"
+    assert "NOT_SET" not in os.environ
+
+
+#: The call that is refused, its error, and what is in the file after a write; or the reason that is given.
+REFUSALS = {
+    "no modes (FAT)": ("os.chmod", errno.EPERM, "new"),
+    "no sync (SMB)": ("os.fsync", errno.EINVAL, "new"),
+    "a disk that fails": ("os.fsync", errno.EIO, "Input/output error"),
+    "a mount point": ("pathlib.Path.replace", errno.EBUSY, "new"),
+    "another disk": ("pathlib.Path.replace", errno.EXDEV, "Invalid cross-device link"),
+}
+
+
+@pytest.mark.parametrize(("call", "number", "expected"), REFUSALS.values(), ids=REFUSALS)
+def test_calls_that_a_file_system_lacks_are_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str, number: int, expected: str
+) -> None:
+    file = tmp_path / "state"
+    file.write_bytes(b"the old content")
+    file.chmod(0o600)
+    with monkeypatch.context() as patch:
+        patch.setattr(call, refused(number))
+        patch.setattr(os, "supports_fd", {*os.supports_fd, os.chmod})
+        why = ""
+        try:
+            write(file, b"new", 0o600, PebbleError)
+        except PebbleError as error:
+            why = str(error).removeprefix(f"{file}: ")
+    assert why or file.read_text() == expected
+    assert [path.name for path in tmp_path.iterdir() if not why] in ([], ["state"])
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+
+
+def test_a_file_that_others_can_read_is_logged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: Any) -> None:
+    def refuse(file: int, _mode: int) -> None:
+        os.fchmod(file, 0o644)  # as all files have it there
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr("os.chmod", refuse)
+    monkeypatch.setattr(os, "supports_fd", {refuse})
+    write(tmp_path / "state", b"new", 0o600, PebbleError)
+    assert "state: others can read it, which cannot be changed here: Operation not permitted" in caplog.text

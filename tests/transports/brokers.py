@@ -161,8 +161,7 @@ class _RabbitMq(_Other):
         }
 
 
-def _aedes(folder: Path, *, sparing: bool = False) -> Broker:
-    """``sparing``: it hangs up on retained messages and on QoS 1."""
+def _aedes(folder: Path) -> Broker:
     del folder
     port = free_port()
     program = f"""
@@ -171,18 +170,14 @@ def _aedes(folder: Path, *, sparing: bool = False) -> Broker:
         const forbidden = {json.dumps([f"/outgoing/{one}" for one in FORBIDDEN])};
         const broker = await Aedes.createBroker();
         broker.authenticate = (client, name, _word, done) => {{ client.account = name; done(null, true); }};
-        broker.authorizePublish = (client, {{ topic, retain, qos }}, done) => {{
+        broker.authorizePublish = (client, {{ topic }}, done) => {{
             const denied = client?.account === "{ROBOT["username"]}" && forbidden.some((one) => topic.endsWith(one));
-            done(denied || ({json.dumps(sparing)} && (retain || qos)) ? new Error("forbidden") : null);
+            done(denied ? new Error("forbidden") : null);
         }};
         net.createServer(broker.handle).listen({port}, "127.0.0.1");
     """
     # From its folder: there Node.js looks for the packages that such a program imports.
     return _Other(port, ["env", "-C", str(_AEDES), "node", "--input-type=module", "--eval", program])
-
-
-def sparing_aedes(folder: Path) -> Broker:
-    return _aedes(folder, sparing=True)
 
 
 MAKERS = {

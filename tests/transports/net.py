@@ -10,22 +10,11 @@ import base64
 import json
 import pickle
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 from pebble.transports import Message, QoS, State, Transport, create
+from tests.support import until
 from tests.transports.forked import Forked
-
-
-class Peer(Protocol):
-    """A client that can die: in a process of its own where the network is real."""
-
-    def publish(self, topic: str, payload: bytes, *, qos: QoS = QoS.DELIVERED, retain: bool = False) -> bool: ...
-
-    def kill(self) -> None:
-        """SIGKILL, and wait until the process is gone."""
-
-    def close(self) -> None:
-        """An orderly close, then the end of the process."""
 
 
 class Net(ABC):
@@ -36,7 +25,7 @@ class Net(ABC):
 
     def __init__(self) -> None:
         self._clients: list[Transport] = []
-        self._peers: list[Peer] = []
+        self._peers: list[Any] = []
 
     # -- to supply
 
@@ -83,8 +72,8 @@ class Net(ABC):
     def echoless_client(self, name: str) -> Transport:
         return self._client(name, self.echoless_settings(), None, True)
 
-    def peer(self, name: str, *, will: Message | None = None) -> Peer:
-        """A connected client in its own process."""
+    def peer(self, name: str, *, will: Message | None = None) -> Any:
+        """A connected client that can be killed: in its own process where the network is real."""
         peer = ProcessPeer(self.kind, name, self.portable_settings(), will)
         self._peers.append(peer)
         return peer
@@ -159,3 +148,21 @@ class ProcessPeer:
     def _release(self) -> None:
         for pipe in (self._process.stdin, self._process.stdout):
             pipe.close()
+
+
+class Received:
+    """A handler that remembers: call it with messages; look at what came."""
+
+    def __init__(self) -> None:
+        self.messages: list[Message] = []
+
+    def __call__(self, message: Message) -> None:
+        self.messages.append(message)
+
+    @property
+    def payloads(self) -> list[bytes]:
+        return [message.payload for message in self.messages]
+
+    def until(self, *payloads: bytes, timeout: float = 10.0) -> bool:
+        """Have exactly these payloads arrived, in this order?"""
+        return until(lambda: self.payloads == list(payloads), timeout)

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 from pebble.transports import GROUP, Message, MqttSettings, QoS, State
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.support import ROOT, Broker
-from tests.transports.net import Net, Peer
+from tests.transports.net import Net
 
 
 class MemoryNet(Net):
@@ -43,7 +43,7 @@ class MemoryNet(Net):
         if self._hub.era is None:
             self._hub.start()
 
-    def peer(self, name: str, *, will: Message | None = None) -> Peer:
+    def peer(self, name: str, *, will: Message | None = None) -> Any:
         client = self.client(name, will=will)
         assert isinstance(client, MemoryTransport)
         return MemoryPeer(self._hub, client)

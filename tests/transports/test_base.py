@@ -1,10 +1,15 @@
-"""Bounds and ages, which every kind of transport inherits and the shared suite does not reach; how kinds are found."""
+"""What transports share: bounds, ages, TLS and files that others replace meanwhile; how kinds are found."""
 
 from __future__ import annotations
 
+import shutil
+import ssl
 import threading
 import tracemalloc
+from collections.abc import Callable
+from contextlib import suppress
 from importlib.metadata import EntryPoint, EntryPoints
+from pathlib import Path
 
 import pytest
 
@@ -14,9 +19,12 @@ from pebble.transports.ages import MessageAges
 from pebble.transports.base import Subscriptions
 from pebble.transports.bounds import BoundedQueue, BoundedTable
 from pebble.transports.memory import MemoryHub, MemoryTransport
+from pebble.transports.renewed import Renewed
+from pebble.transports.settings import TlsSettings
+from pebble.transports.tls import make_context
 from pebble.transports.topics import check_topic
 from pebble.transports.zenoh.keymap import key_to_topic, topic_to_key
-from tests.support import until
+from tests.support import ROOT, until
 
 
 def test_retained_topics_are_bounded_in_number() -> None:
@@ -209,10 +217,6 @@ def test_a_third_party_registers_through_an_entry_point(monkeypatch: pytest.Monk
     with create("theirs", "client", MemoryHub()) as transport:
         assert type(transport).__name__ == "TheirTransport"
         assert transport.state is State.CONNECTED
-
-
-def test_an_unknown_kind_names_the_known_ones(monkeypatch: pytest.MonkeyPatch) -> None:
-    install(monkeypatch, "tests.transports.test_base:TheirTransport")
     with pytest.raises(TransportError, match='no transport "carrier-pigeon": known are ') as refused:
         create("carrier-pigeon", "client", None)
     assert {"memory", "mqtt", "theirs", "zenoh"} <= set(str(refused.value).partition("known are ")[2].split(", "))
@@ -226,3 +230,80 @@ def test_what_is_not_a_transport_is_refused(monkeypatch: pytest.MonkeyPatch) -> 
     install(monkeypatch, "tests.transports.test_base:not_a_transport")
     with pytest.raises(TransportError, match="is not a pebble"):
         create("theirs", "client", None)
+
+
+CERTS = ROOT / "tests" / "data" / "tls"
+EVERY_CIPHER = "ALL:@SECLEVEL=0"
+
+
+def shake_hands(ours: ssl.SSLContext, theirs: ssl.SSLContext) -> ssl.SSLObject:
+    """Return our end of a connection to localhost; in memory."""
+    there, back = ssl.MemoryBIO(), ssl.MemoryBIO()
+    client = ours.wrap_bio(back, there, server_hostname="localhost")
+    server = theirs.wrap_bio(there, back, server_side=True)
+    for end in (client, server) * 4:
+        with suppress(ssl.SSLWantReadError):
+            end.do_handshake()
+    return client
+
+
+def agreed(version: ssl.TLSVersion) -> str | None:
+    """Return what a connection agrees on with a server that speaks only ``version``."""
+    theirs = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    theirs.load_cert_chain(CERTS / "server.crt", CERTS / "server.key")
+    theirs.set_ciphers(EVERY_CIPHER)
+    theirs.minimum_version = theirs.maximum_version = version
+    return shake_hands(make_context(TlsSettings(ca_cert=CERTS / "ca.crt")), theirs).version()
+
+
+@pytest.mark.filterwarnings("ignore:ssl.TLSVersion")
+def test_nothing_below_1_2() -> None:
+    with pytest.raises(ssl.SSLError, match=r"(?i)version|protocol"):
+        agreed(ssl.TLSVersion.TLSv1_1)
+    for version in (ssl.TLSVersion.TLSv1_2, ssl.TLSVersion.TLSv1_3):
+        assert agreed(version) == version.name.replace("_", ".")
+
+
+def _number(file: Path) -> int:
+    return int(file.read_text())
+
+
+def _replaced(file: Path, text: str) -> None:
+    fresh = file.with_name("fresh")
+    fresh.write_text(text)
+    fresh.replace(file)
+
+
+def _linked(file: Path, text: str) -> None:
+    """Renews as certbot does: the name stays, and leads to another file."""
+    target = file.with_name(f"archive-{text}")
+    target.write_text(text)
+    file.unlink()
+    file.symlink_to(target)
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda file: _replaced(file, "2"), 2),
+        (lambda file: _linked(file, "2"), 2),
+        (lambda file: (shutil.rmtree(file.parent), file.parent.mkdir(), file.write_text("2")), 2),
+        (lambda file: file.unlink(), 1),
+        (lambda file: file.write_text("half writt"), 1),
+        (lambda _file: None, 1),
+    ],
+)
+def test_a_change_is_taken_up_and_what_cannot_be_used_is_not(
+    tmp_path: Path, change: Callable[[Path], object], expected: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    file = tmp_path / "certs" / "number"
+    file.parent.mkdir()
+    file.write_text("1")
+    value = Renewed([file], lambda: _number(file))
+    change(file)
+    assert [value.get() for _ in range(3)] == [expected] * 3
+    assert len([record for record in caplog.records if record.levelname == "WARNING"]) <= 1
+    shutil.rmtree(file.parent, ignore_errors=True)
+    file.parent.mkdir()
+    file.write_text("3")
+    assert value.get() == 3

@@ -6,22 +6,20 @@ import json
 import threading
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from pebble.extensions.operator.client.connection import Target, connected, subscribed_stop
 from pebble.extensions.operator.client.discovery import ALL_OUTGOING, Discovery
-from pebble.transports import Message, MqttSettings, QoS
+from pebble.transports import MqttSettings, QoS
 from pebble.transports.mqtt.transport import MqttTransport
 from tests.robot.operator import Operator
 from tests.robot.rig import BASE, STOP
 from tests.robot.rig import Rig as RobotRig
 from tests.sparing_broker import SparingBroker
 from tests.support import Broker, beside, until
-from tests.transports.brokers import MAKERS, ROBOT, Maker, sparing_aedes
-from tests.transports.received import Received
+from tests.transports.brokers import MAKERS, ROBOT, Maker
 
 pytestmark = [pytest.mark.alone, pytest.mark.thorough]  # deadlines are checked; make long PART=brokers runs it
 
@@ -29,15 +27,11 @@ STOPPED = {"latched": True, "boot": "b", "count": 1, "recent": [], "by": "ann", 
 TRUE, FALSE = b'{"value": true}', b'{"value": false}'
 
 
-def needed(name: str) -> Maker:
-    if MAKERS[name].missing():
-        pytest.skip(f"needs {name}: make long PART=brokers")
-    return MAKERS[name]
-
-
 @pytest.fixture(scope="module", params=MAKERS)
 def maker(request: pytest.FixtureRequest) -> Maker:
-    return needed(request.param)
+    if MAKERS[request.param].missing():
+        pytest.skip(f"needs {request.param}: make long PART=brokers")
+    return MAKERS[request.param]
 
 
 @pytest.fixture(scope="module")
@@ -109,23 +103,3 @@ def test_a_whole_robot_is_driven_and_stopped_although_it_may_not_publish_a_strea
             late.wait_for(name)
             late.close()
         assert not rig.operator.on("outgoing/touch-sensors")
-
-
-def test_messages_pass_both_ways_over_a_broker_that_hangs_up_on_retained_messages_and_on_qos_1(
-    tmp_path: Path, base: str, caplog: pytest.LogCaptureFixture
-) -> None:
-    needed("aedes")
-    broker = sparing_aedes(tmp_path)
-    often, will = (
-        settings(broker, reconnect_max_s=0.2),
-        Message(f"{base}/outgoing/online", b"", QoS.DELIVERED, retain=True),
-    )
-    with MqttTransport("robot", often, will=will) as robot, MqttTransport("operator", often, will=will) as operator:
-        seen, commands = Received(), Received()
-        operator.subscribe(f"{base}/outgoing/#", seen)
-        robot.subscribe(f"{base}/incoming/#", commands)
-        robot.publish(f"{base}/outgoing/status", b"1", qos=QoS.DELIVERED, retain=True)
-        assert until(lambda: b"1" in seen.payloads, 20)
-        assert until(lambda: operator.publish(f"{base}/incoming/x", b"", qos=QoS.DELIVERED) and commands.payloads, 20)
-        assert until(lambda: any("keeps no retained messages" in one for one in caplog.messages))
-    broker.stop()

@@ -22,8 +22,7 @@ from paho.mqtt.client import topic_matches_sub
 from pebble.errors import TransportError
 from pebble.transports import Message, QoS, State, Transport, clock
 from tests.support import ROOT, THOROUGH, until
-from tests.transports.net import Net
-from tests.transports.received import Received
+from tests.transports.net import Net, Received
 
 LATEST, DELIVERED = QoS.LATEST, QoS.DELIVERED
 

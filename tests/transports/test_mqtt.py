@@ -4,24 +4,30 @@ from __future__ import annotations
 
 import logging
 import re
+import shutil
+import socket
 import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
 from pebble.errors import TransportError
 from pebble.transports import Message, MqttSettings, QoS, State, TlsSettings, Transport, create
+from pebble.transports.hosts import Address
 from pebble.transports.mqtt import refused_topics
-from pebble.transports.mqtt.client import Client
+from pebble.transports.mqtt.client import Client, Opening
 from pebble.transports.mqtt.connection import UNACKED_LIMIT, UNACKED_RESERVE
+from pebble.transports.tls import make_context
 from tests.support import ROOT, Broker, RefusingBroker, beside, free_port, until
-from tests.tcp_proxy import BridgelessProxy, ForbiddingProxy, Hole, TcpProxy
-from tests.transports.received import Received
+from tests.tcp_proxy import BridgelessProxy, ForbiddingProxy, Hole, SlowTcpProxy, TcpProxy
+from tests.transports.net import Received
 
 DELIVERED = QoS.DELIVERED
 CERTS = ROOT / "tests" / "data" / "tls"
@@ -341,34 +347,6 @@ def test_unacknowledged_messages_are_bounded(tmp_path: Path, clients: Clients, t
     broker.stop()
 
 
-# -- brokers that lack things
-
-
-def test_an_older_value_at_a_broker_is_replaced_unless_others_may_have_chosen_it(
-    broker: Broker, clients: Clients, proxy: TcpProxy, topic: str
-) -> None:
-    """A broker that was restored from an earlier save, or another one behind the same address."""
-    writer, other = clients(proxy.port, "writer"), clients(broker.port)
-    for name, shared in (("own", False), ("shared", True)):
-        writer.publish(f"{topic}/{name}", b"new", qos=DELIVERED, retain=True, shared=shared)
-    writer.subscribe(f"{topic}/echo", Received())  # its answer comes after all acknowledgements
-    proxy.drop()
-    assert reconnected(writer)
-    assert not writer.went_back
-    proxy.cut()
-    for name in ("own", "shared"):
-        other.publish(f"{topic}/{name}", b"old", qos=DELIVERED, retain=True, remember=False)
-    other.subscribe(f"{topic}/echo", Received())
-    proxy.mend()
-    assert reconnected(writer, 3)
-    assert writer.went_back
-    late = Received()
-    clients(broker.port).subscribe(f"{topic}/+", late)
-    assert until(
-        lambda: sorted((one.topic[-3:], one.payload) for one in late.messages) == [("own", b"new"), ("red", b"old")]
-    )
-
-
 # -- refused subscriptions (T21)
 
 
@@ -449,6 +427,38 @@ def test_tls_with_client_certificates(tls_broker: Broker, clients: Clients, topi
     client.publish(topic, payload, qos=DELIVERED)
     assert received.until(payload)
     clients(tls_broker.port, "careless", tls=tls(insecure=True))
+
+
+def test_files_that_were_renewed_count_for_the_next_connection(
+    tls_broker: Broker, strict_broker: Broker, clients: Clients, tmp_path: Path
+) -> None:
+    authority, word = tmp_path / "authority", tmp_path / "word"
+    shutil.copy(CERTS / "other-ca.crt", authority)
+    word.write_text("yesterday's")
+    login = {"username": "goob", "password": "yesterday's", "password_file": word}
+    made = [
+        clients(tls_broker.port, host="localhost", tls=tls(ca_cert=authority), opened=False),
+        clients(strict_broker.port, **login, opened=False),
+    ]
+    assert all(until(lambda client=client: client.open(0.1).problem) for client in made)  # type: ignore[misc]
+    shutil.copy(CERTS / "ca.crt", authority)
+    word.write_text("s3cret-word\n")
+    assert until(lambda: {client.state for client in made} == {State.CONNECTED})
+
+
+@pytest.mark.parametrize("goes_on", [True, False])
+def test_a_handshake_may_take_long_while_bytes_arrive(tls_broker: Broker, goes_on: bool) -> None:
+    patience_s = 0.4
+    with SlowTcpProxy(tls_broker.port, 20) as slow:  # a piece of 512 bytes takes 0.2 s
+        if not goes_on:
+            slow.blackhole()
+        address = Address(socket.AF_INET, ("127.0.0.1", slow.port))
+        opening = Opening("id", MqttSettings(host="localhost"), make_context(tls()), None, address, patience_s)
+        began = time.monotonic()
+        with closing(Client(opening, Mock(), bridge=False)) as client:
+            with nullcontext() if goes_on else pytest.raises(TimeoutError, match="TLS handshake"):
+                client.open()
+            assert patience_s < time.monotonic() - began < 5
 
 
 @pytest.mark.parametrize(

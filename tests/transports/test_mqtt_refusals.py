@@ -15,7 +15,7 @@ from pebble.transports.mqtt.outgoing import InFlightTable
 from pebble.transports.mqtt.refused_topics import RefusedTopics
 from pebble.transports.mqtt.transport import MqttTransport
 from tests.support import Broker, until
-from tests.transports.received import Received
+from tests.transports.net import Received
 
 STEP_S = 0.02
 ROUND_TRIP_S = 0.04

@@ -5,8 +5,6 @@ The same rules hold in virtual time (tests/forwarding/test_services.py).
 
 from __future__ import annotations
 
-import shutil
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -167,22 +165,6 @@ def test_stops_flags_and_commands_arrive_and_come_to_rest_without_bridge_mode(ma
     assert (rig.remote.payloads(VIDEO_FLAG)[-1], rig.local.payloads(AUDIO_FLAG)[-1]) == (FALSE, TRUE)
     too_late = rig.service.forwarder.counters[f"remote: {Drop.LATE.value}"]  # on a busy machine, behind the flags
     assert len(rig.local.on("incoming/flags/git-pull")) + too_late == 1
-
-
-def test_mosquittos_own_clients_use_a_mirror(make: Make, tmp_path: Path) -> None:
-    rig = make("mirror", ZenohEnd(tmp_path), MqttEnd(tmp_path))
-    rig.start()
-    rig.local.publish(STATUS, b'{"kept": 1}', retain=True)
-    assert until(lambda: rig.remote.on(STATUS))
-    sub, pub = shutil.which("mosquitto_sub"), shutil.which("mosquitto_pub")
-    assert sub, "mosquitto-clients is not installed: `make test` installs it"
-    assert pub
-    where = ["-h", "127.0.0.1", "-p", str(rig.ends[REMOTE].section["port"])]
-    listen = [sub, *where, "-t", f"{rig.base}/outgoing/#", "-F", "%r %t %p", "-C", "1", "-W", "10"]
-    earlier = subprocess.run(listen, capture_output=True, text=True, timeout=20, check=True).stdout.strip()
-    assert earlier == f'1 {rig.base}/{STATUS} {{"kept": 1}}'
-    subprocess.run([pub, *where, "-t", f"{rig.base}/{DRIVE}", "-m", '{"x": 0, "z": 1}', "-q", "1"], check=True)
-    assert until(lambda: rig.local.payloads(DRIVE) == [b'{"x": 0, "z": 1}'])
 
 
 #: The service, both ends, and which of them is restored: the one whose programs set the microphone, too.

@@ -1,7 +1,9 @@
-"""What the hub remembers, also on disk; when a will is due; and what is asked of hubs, by real sessions."""
+"""Who is alive in a run directory; what the hub remembers, also on disk; when a will is due; questions to hubs."""
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -11,9 +13,13 @@ import pytest
 import zenoh
 from msgspec.structs import replace
 
-from pebble.transports import QoS, ZenohSettings
+from pebble.errors import TransportError
+from pebble.extensions.media.frames import FrameReader, FrameWriter
+from pebble.transports import QoS, ZenohSettings, create
+from pebble.transports.peers import PeerRegistry, prepare_run_dir
 from pebble.transports.zenoh import wire
 from pebble.transports.zenoh.callbacks import direct
+from pebble.transports.zenoh.hub import ZenohHub
 from pebble.transports.zenoh.hub import journal as journal_module
 from pebble.transports.zenoh.hub import store as hub_store
 from pebble.transports.zenoh.hub.journal import Journal
@@ -23,7 +29,7 @@ from pebble.transports.zenoh.hub.wills import GONE_S, RETURN_S, WillTimes
 from pebble.transports.zenoh.session import close_session, open_session, session_config
 from pebble.transports.zenoh.wire import Hello, Stamp, Will, digest
 from tests.small_disk import SmallDisk
-from tests.support import Clock, needs_root, until
+from tests.support import Clock, needs_root, refused, until
 
 WILL = Will("status", b"gone", QoS.DELIVERED, True)
 
@@ -37,12 +43,6 @@ def store(*records: Record) -> HubStore:
     for record in records:
         made.apply(record)
     return made
-
-
-def test_the_newest_counts_and_an_empty_payload_removes() -> None:
-    made = store(retained("a", b"1"), retained("b", b"1"), retained("a", b"2"), retained("b", b""))
-    assert made.retained() == [retained("a", b"2")]
-    assert (made.get("a"), made.get("b")) == (retained("a", b"2"), None)
 
 
 def test_apply_returns_whether_anything_changed() -> None:
@@ -67,12 +67,6 @@ def test_a_client_is_asked_for_what_is_missing_or_its_own_and_changed(
 ) -> None:
     made = store(retained("mine", b"1", "me"), retained("theirs", b"1", "somebody"))
     assert made.lacks(Hello("me", 5, None, own)) == lacking
-
-
-def test_its_records_make_an_equal_store() -> None:
-    made = store(retained("b", b"1"), retained("a", b"2"), StoredWill("client", WILL), retained("b", b""))
-    copy = store(*made.records())
-    assert (copy.retained(), copy.wills(), copy.will("client")) == (made.retained(), {"client"}, WILL)
 
 
 @pytest.fixture
@@ -292,3 +286,63 @@ def test_what_could_not_be_read_stays(tmp_path: Path) -> None:
     journal.rewrite([("b", b"new")])
     journal.close()
     assert read(path) == [b"old", b"new"]
+
+
+def test_newcomers_are_connected_to_at_once_and_waited_for_when_ready(tmp_path: Path) -> None:
+    registry = PeerRegistry(tmp_path)
+    first, second = registry.register("first"), registry.register("second")
+    assert set(registry.sockets()) == {first.socket, second.socket}
+    assert registry.ready() == {}
+    first.ready()
+    assert registry.ready() == {first.name: "first"}
+    assert registry.ready(but=first.name) == {}
+    assert registry.sockets(but=first.name) == [second.socket]
+    first.release()
+    second.release()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_socket_path_that_is_too_long_is_an_error_that_names_the_setting(tmp_path: Path) -> None:
+    longest = tmp_path / ("x" * (107 - len(f"{tmp_path}//12345678.sock")))
+    prepare_run_dir(longest)
+    assert longest.stat().st_mode & 0o777 == 0o700
+    longer = tmp_path / f"{longest.name}x"
+    with pytest.raises(TransportError, match=r"too long for a unix socket .*transport.run_dir"):
+        prepare_run_dir(longer)
+    assert not longer.exists()
+
+
+USERS: dict[str, Callable[[Path], object]] = {
+    "peer": lambda folder: create("zenoh", "peer", ZenohSettings(run_dir=folder)).open(0.0),
+    "hub": lambda folder: ZenohHub(ZenohSettings(run_dir=folder)).open(),
+    "reader": lambda folder: FrameReader(folder, "camera").open(),
+    "writer": lambda folder: FrameWriter(folder, "camera", slots=2, capacity=100).open(),
+}
+
+
+@pytest.mark.parametrize("use", USERS.values(), ids=USERS)
+def test_a_folder_that_another_user_made_is_used_by_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, use: Callable[[Path], object]
+) -> None:
+    (tmp_path / "run").mkdir(mode=0o700)
+    monkeypatch.setattr(os, "getuid", lambda: (tmp_path / "run").stat().st_uid + 1)
+    with pytest.raises(TransportError, match=f"{tmp_path}/run(:| is not) .* user"):
+        use(tmp_path / "run")
+
+
+def test_a_folder_that_others_may_write_to_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run").chmod(0o770)
+    with pytest.raises(TransportError, match="others may write there"):
+        prepare_run_dir(tmp_path / "run")
+    assert (tmp_path / "run").stat().st_mode & 0o777 == 0o770, "it may be any folder, and not a robot's"
+
+
+def test_a_full_disk_keeps_no_process_from_being_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    registry = PeerRegistry(tmp_path)
+    lock = registry.register("first")
+    monkeypatch.setattr(os, "pwrite", refused(errno.ENOSPC))
+    lock.ready()
+    assert registry.ready() == {lock.name: "?"}
+    lock.release()
+    assert list(tmp_path.iterdir()) == []

@@ -29,7 +29,7 @@ from pebble.transports.zenoh import publishers, wire
 from pebble.transports.zenoh.hub import ZenohHub
 from tests.support import ROOT, free_port, until
 from tests.transports.forked import Forked
-from tests.transports.received import Received
+from tests.transports.net import Received
 from tests.transports.zenoh_net import HubProcess, ZenohNet, stranger_at
 
 DELIVERED = QoS.DELIVERED
@@ -89,27 +89,16 @@ def listener(robot: ZenohNet) -> Any:
     return peer
 
 
-def ended(robot: ZenohNet) -> Iterator[ZenohNet]:
-    """Run the robot's hub for a test."""
-    robot.start_network()
-    yield robot
-    robot.close_clients()
-    if robot.hub.running:
-        robot.hub.kill()
-
-
 @pytest.fixture
 def robot(tmp_path: Path) -> Iterator[ZenohNet]:
     """A robot whose hub keeps no journal."""
     robot = ZenohNet(tmp_path)
     robot.hub = HubProcess(tmp_path / "run")
-    yield from ended(robot)
-
-
-@pytest.fixture
-def remembering(tmp_path: Path) -> Iterator[ZenohNet]:
-    """A robot whose hub keeps a journal."""
-    yield from ended(ZenohNet(tmp_path))
+    robot.start_network()
+    yield robot
+    robot.close_clients()
+    if robot.hub.running:
+        robot.hub.kill()
 
 
 # -- no single point of failure
@@ -248,9 +237,6 @@ def _links(transport: Any) -> int:
     return len(transport.session.info.links())
 
 
-# -- wills and the journal
-
-
 def test_a_will_survives_a_hub_without_a_journal(robot: ZenohNet) -> None:
     received: list[Message] = []
     client = robot.client("client")
@@ -263,17 +249,6 @@ def test_a_will_survives_a_hub_without_a_journal(robot: ZenohNet) -> None:
     assert received == []
     mortal.kill()
     assert until(lambda: [m.payload for m in received] == [b"dead"], 5)
-
-
-def test_the_will_of_one_who_died_with_the_hub_is_spoken_after_its_restart(remembering: ZenohNet) -> None:
-    received: list[Message] = []
-    client = remembering.client("client")
-    client.subscribe("will", received.append)
-    mortal = remembering.peer("mortal", will=WILL)
-    remembering.hub.kill()
-    mortal.kill()
-    remembering.hub.start()
-    assert until(lambda: [m.payload for m in received] == [b"dead"], 8)
 
 
 # -- nothing open to the world
@@ -326,18 +301,6 @@ def test_two_robots_linked_by_tls_share_one_link_and_no_more(robot: ZenohNet, tm
         assert (b"stranger" in received.payloads, bystander.payloads) == (False, [b"end"])
     finally:
         other.stop()
-
-
-def test_a_hub_that_reaches_another_one_says_what_is_lost(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    settings = [
-        ZenohSettings(run_dir=tmp_path / "a", listen=(endpoint,)),
-        ZenohSettings(run_dir=tmp_path / "b", connect=(endpoint,)),
-    ]
-    with contextlib.ExitStack() as stack:
-        for one in settings:
-            stack.callback(ZenohHub(one).open().close)
-        assert until(lambda: caplog.text.count("another hub is connected to this one") == 2)
 
 
 def test_only_certificates_with_an_allowed_name_get_through(tmp_path: Path) -> None:

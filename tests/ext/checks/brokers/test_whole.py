@@ -20,7 +20,7 @@ from pebble.transports.mqtt.transport import MqttTransport
 from tests.commands.command_line import Run, running
 from tests.support import ROOT, Broker, further, until
 from tests.transports.brokers import MAKERS
-from tests.transports.received import Received
+from tests.transports.net import Received
 
 DOCUMENT = ROOT / "docs" / "brokers.md"
 MARKS = {State.OK: "yes", State.WARN: "limits", State.FAILED: "**no**", State.SKIPPED: "–"}

@@ -1,4 +1,4 @@
-"""Subscribed filters never overlap and match everything that is wanted; own and repeated messages are recognised."""
+"""Filters: which topics they match, which overlap, and their Zenoh keys; own and repeated messages are recognised."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ import random
 import tracemalloc
 
 import pytest
+import zenoh
+from paho.mqtt.client import topic_matches_sub
 
 from pebble.transports import Message
 from pebble.transports.mqtt import filters
 from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, overlap
 from pebble.transports.topics import matches
-from tests.support import THOROUGH, some
+from pebble.transports.zenoh.keymap import filter_to_key, key_to_topic, topic_to_key
+from tests.support import THOROUGH, cases, some
 
 LEVELS = ["a", "b", "$x", "+"]
 TOPICS = [
@@ -63,13 +66,6 @@ def check(filters: BrokerFilters, wanted: list[str]) -> None:
     assert needed <= frozenset().union(*(caught(filter_) for filter_ in filters))
 
 
-def test_the_same_filter_again_is_asked_for_again() -> None:
-    filters = BrokerFilters()
-    assert filters.add("a/#") == ("a/#", [])
-    assert filters.add("a/b") == ("a/#", [])
-    assert filters.add("+/b") == ("+/#", ["a/#"])
-
-
 def retained(payload: bytes, topic: str = "flag") -> Message:
     return Message(topic, payload, retain=True)
 
@@ -106,3 +102,54 @@ def test_large_payloads_and_many_topics_take_little_memory(monkeypatch: pytest.M
     assert used < 500_000
     assert own_filter.is_echo(retained(bytes(100_000), "flag199"))
     assert not own_filter.is_echo(retained(bytes(100_000), "flag0"))
+
+
+ODD_LEVELS = ["", "a", "b", "ab", "@", "@a", "$", "$a", "%", "%40", "*", "**", "a*", "?"]
+ODD_LEVELS += ["%25", "ä", "a b", "@retain", "$*"]
+
+
+def random_filter(dice: random.Random) -> str:
+    levels = dice.choices([*ODD_LEVELS, "+", "+", "a", "a"], k=dice.randint(1, 4))
+    return "/".join([*levels, *dice.choice(([], [], ["#"]))]) or "#"
+
+
+def random_topic(dice: random.Random) -> str:
+    return "/".join(dice.choices([*ODD_LEVELS, "a", "a", "a"], k=dice.randint(1, 5))) or "a"
+
+
+def test_filters_and_keys_match_where_paho_matches_topics() -> None:
+    dice = random.Random(1)
+    matched = 0
+    for _ in range(cases(4_000, 20_000)):
+        filter_, topic = random_filter(dice), random_topic(dice)
+        wanted = topic_matches_sub(filter_, topic)
+        matched += wanted
+        assert matches(filter_, topic) is wanted, (filter_, topic)
+        have = zenoh.KeyExpr(filter_to_key(filter_)).intersects(zenoh.KeyExpr(topic_to_key(topic)))
+        assert have == wanted, (filter_, topic)
+    assert matched > 60
+
+
+def test_every_topic_comes_back_and_no_two_share_a_key() -> None:
+    dice = random.Random(2)
+    topics = {random_topic(dice) for _ in range(3_000)}
+    keys = {topic_to_key(topic) for topic in topics}
+    assert len(keys) == len(topics)
+    assert {key_to_topic(key) for key in keys} == topics
+
+
+@pytest.mark.parametrize(
+    ("topic", "key"),
+    [
+        *((same, same) for same in ("pebble/robots/goob/incoming/drive-values", "Fred's lamp/über", "a-b_c.d")),
+        *(("/a//b/", "%/a/%/b/%"), ("@a/@", "%40a/%40"), ("50%", "50%25"), ("$SYS/x", "@%24SYS/x"), ("a/$x", "a/%24x")),
+    ],
+)
+def test_only_what_zenoh_forbids_is_escaped(topic: str, key: str) -> None:
+    assert topic_to_key(topic) == key
+
+
+def test_no_topic_maps_to_the_hubs_own_keys() -> None:
+    for filter_ in ("#", "+/#", "@retain/#", "+/+", "@hub/hello"):
+        assert not zenoh.KeyExpr(filter_to_key(filter_)).intersects(zenoh.KeyExpr("@retain/a"))
+        assert not zenoh.KeyExpr(filter_to_key(filter_)).intersects(zenoh.KeyExpr("@hub/hello"))
