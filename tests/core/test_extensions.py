@@ -274,6 +274,27 @@ def test_an_owner_of_motors_is_a_device(tmp_path: Path) -> None:
     assert config.motor_owners == ("lamp",)
 
 
+PROTOCOL = """
+from pebble.contract.serial_protocols import SerialProtocol
+from pebble.extension import Extension
+
+ROW = SerialProtocol("pebble.services.serial_mcu_bridge.imu.bridge:ImuBridge", is_imu=True)
+EXTENSION = Extension(name="gyro", package="gyro.py", protocols={"gyro_v1": ROW})
+"""
+
+
+def test_a_row_is_all_that_a_serial_protocol_needs_besides_its_service(tmp_path: Path) -> None:
+    (tmp_path / "gyro.py").write_text(PROTOCOL)
+    path = write(tmp_path, {"gyro.py": {}})
+    raw = json.loads(path.read_text())
+    line = {"enabled": True, "protocol": "gyro_v1", "serial": {"port": "/dev/gyro"}}
+    path.write_text(json.dumps(raw | {"services": {"serial_mcu_bridge": line}}))
+    done = pebble("check", str(path))
+    assert (done.returncode, done.stderr, "gyro_v1 at /dev/gyro" in done.stdout) == (0, "", True)
+    path.write_text(json.dumps(raw | {"services": {"serial_mcu_bridge": line | {"protocol": "gyro"}}}))
+    assert '"pebble_serial_v1" or "gyro_v1"' in pebble("check", str(path)).stderr
+
+
 LAMP_FILE, LEGS_FILE = LAMP % {"name": "lamp", "drives": False}, LAMP % {"name": "legs", "drives": True}
 #: Files and entries that a check refuses, and what it says.
 REFUSED: dict[str, tuple[dict[str, str], dict[str, Any], str]] = {

@@ -79,6 +79,11 @@ def published(drill: Drill, metric: str) -> list[Any]:
     return [json.loads(payload) for payload in drill.received(f"{BASE}/outgoing/{metric}")]
 
 
+def test_groups_whose_topic_is_refused_are_not_announced() -> None:
+    (capabilities,) = published(online("minilamp", refused={f"{BASE}/incoming/group"}), "capabilities")
+    assert "groups" not in capabilities["value"]
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_its_capabilities_are_a_retained_message(kind: str) -> None:
     drill = online(kind)

@@ -166,6 +166,16 @@ def test_a_held_key_causes_one_probe_a_second(world: World) -> None:
     assert 4 <= sum(probe.topic == TOPIC for probe in world.local.probes[before:]) <= 6
 
 
+def test_probes_of_others_are_forwarded_once_and_prove_nothing(world: World) -> None:
+    started(world)
+    probe = b" \t" * 16
+    for _ in range(2):
+        world.remote.publish(DRIVE, probe)
+    world.run(0)
+    assert [message.payload for message in world.local.probes].count(probe) == 1
+    assert arrives(world, world.local, DRIVE, MOVE)
+
+
 def examine(cycles: Cycles, side: Side, topic: str, payload: bytes) -> Finding:
     """Any topic but that of stops is one of drive commands."""
     subject = SUBJECTS[f"{BASE}/{topic}" if topic == ESTOP else TOPIC]

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from pebble.forwarding.event_buffer import LIMIT
 from pebble.forwarding.probes import PROBE_REQUEST
 from pebble.forwarding.routing import Side
 from pebble.forwarding.service import CHECK_AGAIN_S
@@ -168,12 +169,13 @@ class TestStops:
         assert world.remote.payloads(STOP) == [b"now"]
 
 
-def test_events_of_an_outage_wait(world: World) -> None:
+def test_events_of_an_outage_wait_and_beyond_the_bound_the_oldest_go(world: World) -> None:
     do(world, "start cut")
-    for number in range(3):
+    for number in range(LIMIT + 100):
         world.local.publish(EVENT, b"%d" % number)
     do(world, "mend")
-    assert world.remote.payloads(EVENT) == [b"0", b"1", b"2"]
+    assert world.remote.payloads(EVENT) == [b"%d" % number for number in range(100, LIMIT + 100)]
+    assert world.service.dropped()["events"] == 100
 
 
 def test_at_each_connection_commands_are_probed(world: World) -> None:

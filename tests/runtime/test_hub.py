@@ -17,6 +17,7 @@ from pebble.config import parse
 from pebble.runtime.connections import hub_settings
 from pebble.runtime.hub import WILLS
 from pebble.transports import QoS, ZenohSettings, create
+from pebble.transports.zenoh import wire
 from pebble.transports.zenoh.hub.admission import Admission
 from pebble.transports.zenoh.hub.intake import ASKED_BYTES, QUEUE_BYTES, SENDERS, Intake
 from pebble.transports.zenoh.hub.journal import Journal
@@ -132,6 +133,21 @@ def test_a_query_follows_each_task_and_too_large_a_hello_is_not_answered() -> No
     while (task := intake.take(0)) is not None:
         task()
     assert done == ["task 0", "query 0", "task 1", "query 1", "task 2", "query 2"]
+
+
+@pytest.mark.parametrize(("waits_s", "works"), [(3.0, True), (0.0, False)])
+def test_a_query_that_no_one_waits_for_any_more_is_not_answered(
+    monkeypatch: pytest.MonkeyPatch, waits_s: float, works: bool
+) -> None:
+    monkeypatch.setattr(wire, "RETAINED_ANSWER_S", waits_s)
+    intake = Intake()
+    worked: list[Any] = []
+    asked: Any = Asked("@retain/**", 1)
+    intake.ask(worked.append, asked)
+    task = intake.take(0)
+    assert task is not None
+    task()
+    assert (asked.dropped, worked == [asked]) == (not works, works)
 
 
 def test_beyond_the_room_eight_senders_wait_and_what_others_send_is_dropped(caplog: pytest.LogCaptureFixture) -> None:

@@ -167,6 +167,13 @@ def test_of_a_group_a_board_gets_all_its_commands_in_a_write_or_none(
     assert len(written) == 1 + bool(obeyed)
 
 
+def test_without_the_key_a_board_takes_no_groups(memory_rig: SerialRig) -> None:
+    mcu, _ = memory_rig.up(STATION)
+    memory_rig.world.command("group", GOOD)
+    memory_rig.world.command("mcu/hs105-sta/o4_set", {"on": True, "group": True})
+    assert mcu.obeyed() == [(7, b"\1")]
+
+
 # -- plugging in and out, restarts and new firmware
 
 

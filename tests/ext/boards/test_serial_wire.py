@@ -310,6 +310,13 @@ def test_refused_with_its_reason(payload: bytes, reason: str) -> None:
     assert reason in str(caught.value)
 
 
+def test_every_beginning_of_a_manifest_is_refused_and_nothing_else_is_raised() -> None:
+    whole = STATION.describe()
+    for length in range(len(whole)):
+        with pytest.raises(PayloadError):
+            parse_describe(whole[:length])
+
+
 def test_what_is_understood_all_the_same() -> None:
     """A command and its report may share a name, a boolean has no scale, and flags of the future are ignored."""
     assert parse_describe(one()).interfaces[0].name == "a", "the template of the cases above is good"

@@ -97,6 +97,9 @@ ONE, TWO = ("serial",), ("serial", "tail")
 MEMBERS: dict[str, tuple[tuple[str, ...], str]] = {
     "a single owner": (ONE, "a :a>all =a>serial serial?a =a>serial serial+a = a ="),
     "two owners": (TWO, "a =a>serial,a>tail serial+a =a>tail tail?a =a>tail tail+a ="),
+    "one that was never heard": (ONE, "a 300s =a>serial"),
+    "a new stop after a reset": (ONE, "a serial+a serial-a b :b>all =b>serial"),
+    "frozen, a newer state before it": (ONE, "a serial+b =a>serial serial+a ="),
     "of an owner that restarts": (ONE, "serial0 a =a>serial serial0 =a>serial serial+a ="),
     "killed before its file is written": (ONE, "a serial?a serial0 =a>serial serial+a ="),
     "whose state shows it reset before it was saved": (ONE, "a serial?a serial-a ="),

@@ -220,6 +220,22 @@ def test_every_field_of_a_line_is_published_and_what_the_motors_get_again_while_
     assert until(lambda: bench.payloads("motor-power/serial")[-1] == {"left": 0.0, "right": 0.0}, 5)
 
 
+def test_a_drive_command_without_an_axis_is_logged_once_for_each_sender(
+    bench: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
+    for number in range(60):
+        bench.send("drive-values", {"linear": {"x": 1}, "source": f"s{number % 3}"})
+        bench.send("drive-values", {"X": number})
+    for number in range(1000):
+        bench.send("drive-values", {"Z": 1, "source": f"stranger {number}"})
+    assert bench.moves(0.25)
+    lines = [record.getMessage() for record in caplog.records if "none of x, z and y" in record.getMessage()]
+    assert [sum(f"from {name!r}" in line for line in lines) for name in ("s0", "s1", "s2")] == [1, 1, 1]
+    assert sum("'X'" in line for line in lines) == 1
+    assert len(lines) == 17  # 16 senders, and all others together
+    assert "'linear', 'source'" in lines[0]
+
+
 def test_stops_are_subscribed_to_before_drive_commands() -> None:
     assert handled(MotorBridge)[:5] == [ESTOP, ESTOP_RESET, CONTROL, CONTROL_TAKE, DRIVE]
 
