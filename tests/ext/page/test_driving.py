@@ -17,7 +17,7 @@ from pebble.contract.payloads import LinkLevel, LinkState
 from pebble.extensions.operator.client.pace_of_link import WIDE
 from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.extensions.page.drive import drivers as module
-from pebble.extensions.page.drive.driven_robot import Tab
+from pebble.extensions.page.drive.driven_robot import TABLE, Event, State, Tab
 from pebble.extensions.page.drive.drivers import MOST_WISHES, Drivers
 from pebble.extensions.page.messages import DriveOp, DriverView
 from pebble.transports import Message, QoS
@@ -304,6 +304,17 @@ HISTORIES = {
         ann rests 1: zero
         moved: nobody
         ann drives 1: Let go first""",
+    "each gesture has a greater number": """
+        ann takes
+        ann drives 5: go
+        ann rests 5: zero
+        ann drives 4: Let go first
+        ann drives 6: go""",
+    "a final zero of who drives stays final": """
+        ann takes
+        ann drives 1: go
+        ann rests 1 finally: final
+        ann drives 1: Let go first""",
     "a gesture whose end was lost ends with the next one": """
         ann takes
         ann drives 1: go
@@ -414,6 +425,14 @@ HISTORIES = {
         ann takes
         ann drives 1: Let go first
         ann drives 2: go""",
+    "who gives control back drives no more": """
+        ann takes
+        ann drives 1: go
+        ann releases: final
+        ann sees
+        ann drives 2: Take control to drive
+        bob takes
+        bob sees: you""",
     "control ends after a minute without a gesture": """
         ann takes
         wait 59
@@ -486,6 +505,12 @@ HISTORIES = {
         ann sees: you
         ann leaves
         wait 5.1
+        ann returns
+        ann sees""",
+    "a page that gave control back is not awaited": """
+        ann takes
+        ann releases
+        ann leaves
         ann returns
         ann sees""",
     "control that was taken meanwhile does not come back": """
@@ -568,6 +593,11 @@ ROBOT_GIVES = {
         ann sees: you
         ann drives 1: Let go first
         ann drives 2: go""",
+    "a robot that keeps control no more has taken it away": """
+        ann takes
+        ann drives 1: go
+        robot keeps nothing: final
+        ann sees: no control""",
     "a robot that was forgotten has taken it away": """
         ann takes
         ann drives 1: go
@@ -636,6 +666,14 @@ def test_a_link_thins_out_what_moves_and_nothing_that_stops(world: World, level:
     world.sent.clear()
     world.tell("ann rests 1: zero\n stop: final")
     assert {sent_qos for _, _, sent_qos in world.sent} == {QoS.DELIVERED}
+
+
+def test_only_a_page_with_control_moves_and_what_ends_motion_halts() -> None:
+    for (state, event), step in TABLE.items():
+        assert step.halts == (state is State.MOVING and event is not Event.LETS_GO), (state, event)
+        assert (step.state is State.MOVING) == (event is Event.MOVES), (state, event)
+        assert (step.state is State.FREE) == (event in (Event.ENDED, Event.LOST)), (state, event)
+    assert {event for state, event in TABLE if state is State.FREE} == {Event.GIVEN}
 
 
 def test_a_page_has_sixteen_robots_at_most(world: World) -> None:

@@ -74,6 +74,14 @@ def test_a_page_without_answers_may_not_drive(pings: bool, seconds: float, probl
     assert page.clock.problem(newest + seconds) == problem
 
 
+def test_a_round_trip_that_was_refused_counts_until_the_next_one() -> None:
+    page = Page(0.003, 0.003).ping(5)
+    page.up = 0.7
+    assert "late" in page.ping().clock.problem(page.now)
+    page.up = 0.003
+    assert page.ping().clock.problem(page.now) == ""
+
+
 def test_messages_that_wait_do_not_move_the_base() -> None:
     page = Page(0.003, 0.003).ping(5)
     page.up = 0.5

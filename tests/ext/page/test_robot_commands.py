@@ -99,7 +99,7 @@ def test_capabilities_may_name_another_topic_of_the_same_robot(fields: dict[str,
     usual = f"{BASE}/incoming/{metric}"
     assert published(fields, nested(section, {key: own})).topic == (own if metric in NAMED else usual)
     below = ("#", "a\x01b", "x" * 1100, "/".join("x" * 250), "drive-values", "estop")
-    foreign = ["pebble/robots/fred/incoming/x", f"{BASE}/outgoing/x", 7]
+    foreign = ["pebble/robots/fred/incoming/x", f"{BASE}/outgoing/x", f"{BASE}x/incoming/x", 7]
     for topic in (*foreign, *(f"{BASE}/incoming/{one}" for one in below)):
         assert published(fields, nested(section, {key: topic})).topic == usual
     for odd in ("text", None):

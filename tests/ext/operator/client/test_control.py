@@ -157,6 +157,35 @@ def test_control_can_be_taken_and_who_has_lost_it_does_not_take_it_back() -> Non
 # -- several motor owners
 
 
+def test_a_motor_owner_that_is_started_again_gives_control_anew() -> None:
+    world = World()
+    ann = world.holder()
+    before = ann.decided
+    world.robot.owners[0].start(world.now)
+    world.receive(world.robot.states())
+    assert (ann.held, ann.key) == (False, "")
+    world.wait(STEP_S)
+    assert ann.held
+    assert ann.decided != before
+
+
+def test_the_first_motor_owner_by_name_decides_and_who_has_only_another_gives_it_back() -> None:
+    world = World("arm", "wheels")
+    ann, bob = world.holder(), world.client("bob")
+    world.drive(ann)
+    world.robot.owners[1].start(world.now)
+    bob.ask(world.now)
+    out = bob.tick(world.now)  # it is heard before the holder is
+    world.receive(world.robot.take(out, world.now))
+    assert world.held == [True, False]
+    assert world.drive(bob) == [False, False]
+    for _ in range(round(2.5 / STEP_S)):
+        world.drive(ann)
+        world.wait(STEP_S)
+    assert world.held == [True, False]
+    assert world.drive(ann) == [True, True]
+
+
 def test_random_schedules_never_have_two_holders_and_end_with_one() -> None:
     for seed in range(cases(20, 400)):
         chance = random.Random(seed)

@@ -145,7 +145,7 @@ def test_zeros_and_ends_of_scripts_go_to_no_other_robot() -> None:
     stop = sender(GOOB)
     value = {
         "drive": {"available": True, "topic": "pebble/robots/fred/incoming/drive-values"},
-        "autonomy": {"command_topic": "pebble/robots/fred/incoming/autonomy-command"},
+        "autonomy": {"command_topic": "pebble/robots/goob2/incoming/autonomy-command"},
     }
     receive(stop, capabilities(GOOB, value), now=0.0)
     assert topics(stop.tick(0.0)) == [f"{GOOB}/incoming/autonomy-command", f"{GOOB}/incoming/drive-values"]
@@ -204,6 +204,9 @@ def test_a_person_may_end_it() -> None:
 
 #: What may wrongly be taken for something that does not drive, and how often a stop of all is sent to it in 2 s.
 MOVERS: dict[str, tuple[Message, int]] = {
+    "a board of the original": (outgoing(GOOB, "online", {"t": 1, "subscribes": ["incoming/drive-values"]}), 4),
+    "another type": (outgoing("pebble/lamps/mini", "online", {"t": 1}), 4),
+    "driving without a stop": (capabilities(GOOB, {"drive": {"available": True}}), 4),
     "no capabilities": (outgoing(GOOB, "online", {"t": 1}), 4),
     "an unknown section": (capabilities(GOOB, {"arm": {"available": True}}), 4),
     "a drive section that is none": (capabilities(GOOB, {"drive": ["x"], "estop": 5}), 4),
@@ -239,6 +242,20 @@ def test_what_no_stop_can_hold_gets_zeros_for_a_minute_and_is_never_confirmed(ow
     assert topics(stop.tick(0.5)) == [ESTOP, f"{GOOB}/incoming/autonomy-command", DRIVE, ros]
     assert stop.robots[GOOB].why == "it has motors that no stop can hold: they get zeros"
     assert (sent_times(stop, 100.0)[-1], stop.robots[GOOB].progress) == (59.5, Progress.NOT_CONFIRMED)
+
+
+def test_named_robots_are_all_stopped_however_many() -> None:
+    bases = [f"pebble/robots/r{number}" for number in range(MAX_ROBOTS + 5)]
+    assert len(sender(*bases).tick(0.0)) == 2 * len(bases)
+
+
+def test_who_and_why_are_cut_and_made_harmless() -> None:
+    stop = sender(GOOB, by="ann\x1b[31m@" + "d" * 50, why='say "stop" ' + "é" * 50)
+    body = json.loads(stop.tick(0.0)[0].payload)
+    assert (len(body["by"]), len(body["why"])) == (32, 40)
+    assert body["by"].startswith("ann?[31m@d")
+    assert body["why"].startswith("say ?stop? ?")
+    assert len(stop.tick(0.5)[0].payload) < 128
 
 
 # -- all robots
@@ -425,6 +442,23 @@ def test_a_hold_stops_a_robot_again_that_has_lost_its_memory_and_no_other() -> N
     assert topics(stop.tick(20.0)) == [ESTOP, DRIVE]
     receive(stop, *restarted.take(stop.tick(20.5)), now=20.6)
     assert stop.robots[GOOB].confirmed_s == pytest.approx(0.6)
+
+
+def test_more_holds_than_an_owner_remembers_names_come_to_rest() -> None:
+    """Else each would take the place of another for ever, and a robot that is reset on purpose would not stay free."""
+    stops, robot = [sender(GOOB, hold=True) for _ in range(9)], Robot(GOOB, "serial")
+    for now in range(10):
+        for stop in stops:
+            states = robot.take(stop.tick(float(now)))
+            for other in stops:
+                receive(other, robot.capabilities(), *states, now=float(now))
+    assert all(stop.confirmed for stop in stops)
+    latch = robot.owners[0].latch
+    assert latch.count == 9
+    assert latch.reset(latch.boot, latch.count, 0, 0)
+    for stop in stops:
+        receive(stop, robot.owners[0].state(), now=20.0)
+    assert [stop.tick(20.0) for stop in stops] == [[]] * 9
 
 
 def test_states_that_change_quickly_do_not_make_it_send_more_often() -> None:

@@ -111,6 +111,14 @@ def test_a_reset_frees_each_owner_by_its_own_boot_and_count() -> None:
     assert (reset.waiting, reset.free, reset.refusals()) == ([], True, {})
 
 
+def test_only_stopped_owners_are_reset() -> None:
+    robot, estop = stopped("left", "right")
+    latch = robot.owners[0].latch
+    assert latch.reset(latch.boot, latch.count, age=0, now=0)
+    publish(estop, [robot.owners[0].state()])
+    assert list(Reset(estop, "").shown) == ["right"]
+
+
 def test_a_reset_ends_no_stop_that_was_not_shown() -> None:
     robot, estop = stopped("serial")
     reset = Reset(estop, "ann@desk")

@@ -64,6 +64,8 @@ def test_values_are_accepted_also_as_text(setting: Setting, raw: Any, value: Any
         (LAPS, -1, "laps below minimum 0"),
         (SPEED, math.nan, "speed must be a finite number"),
         (SPEED, "1e999", "speed must be a finite number"),
+        (SPEED, 10**400, "speed must be a finite number"),
+        (LAPS, 1e300, "laps must be a whole number"),
         (SPEED, True, "speed must be a number"),
         (LAPS, 1.5, "laps must be a whole number"),
         (LIGHT, "maybe", "light must be true or false"),

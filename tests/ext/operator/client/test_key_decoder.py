@@ -46,3 +46,10 @@ def test_the_rest_of_a_sequence_that_comes_late_is_no_sequence() -> None:
     assert decoder.feed(b"a", 2.0) == ["escape", "a"]
     decoder.feed(b"\x1b[", 3.0)
     assert decoder.feed(b"w", 4.0) == ["w"]
+
+
+def test_what_never_ends_is_forgotten() -> None:
+    decoder = KeyDecoder()
+    for _ in range(100):
+        decoder.feed(b"\x1b[" + b";" * 40, 0.0)
+    assert decoder.feed(b"w", 1.0) == ["w"]

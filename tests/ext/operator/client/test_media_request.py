@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
+
 import pytest
 
 from pebble.contract import STATUS
+from pebble.extensions.operator.client.broker import Broker
+from pebble.extensions.operator.client.media_request import shared
 from pebble.extensions.operator.client.media_request.shared import SharedRequest
 from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.transports import Message
@@ -35,6 +39,26 @@ class Requested:
 
     async def step(self) -> None:
         await self.request.follow(self.view, "json")
+
+
+async def test_it_is_withdrawn_once_there_is_a_broker_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shared, "LINGER_S", 0.0)
+    there, one = [True], Requested()
+    monkeypatch.setattr(Broker, "connected", property(lambda _: there[0]))
+    await one.broker.open()
+    one.request.want(True)
+    task = asyncio.create_task(one.request.run(one.step))
+    await until(lambda: one.robot.requests)
+    there[0] = False
+    one.request.want(False)
+    await asyncio.sleep(0.5)
+    assert one.robot.encodings == ["json"]
+    there[0] = True
+    await until(lambda: one.robot.encodings == ["json", None])
+    one.request.close()
+    await task
+    await one.broker.close()
+    one.robot.close()
 
 
 async def test_nothing_is_asked_of_a_robot_that_waits() -> None:

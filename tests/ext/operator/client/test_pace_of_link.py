@@ -81,6 +81,14 @@ def test_a_stop_of_all_waits_for_silent_robots_as_on_the_thinnest_link() -> None
     assert max(silent_after(link=level) for level in LEVELS) == COLLECT_S
 
 
+@pytest.mark.parametrize(("level", "limit_s"), {"wide": 2, "narrow": 3, "thin": 5}.items())
+def test_a_robot_whose_link_is_known_is_awaited_for(level: LinkLevel, limit_s: float) -> None:
+    discovery = Discovery()
+    discovery.receive(outgoing(GOOB, "link", msgspec.to_builtins(link(level, 4)), retain=True), 0.0, 0.0)
+    assert [discovery.awaits_heartbeat(limit_s + more_s) for more_s in (-0.1, 0.1)] == [True, False]
+    assert limit_s == silent_after(link=level)
+
+
 def test_a_first_robot_is_awaited_as_one_of_which_nothing_is_known() -> None:
     assert [Discovery().awaits_heartbeat(after_s) for after_s in (1.9, 2.1)] == [True, False]
     discovery = Discovery()

@@ -22,6 +22,8 @@ from pebble.extensions.operator.client.stamps import stamp_of
         ({"t": "1710969600123"}, None),
         ({"t": math.nan}, None),
         ({"t": 10**400}, None),
+        ({"t": -(10**400)}, None),
+        ({"t": math.inf}, None),
         ({}, None),
         ([1710969600123], None),
     ],

@@ -23,6 +23,7 @@ from tests.fakes.bad_brokers import BEHAVIOURS, resolving, serving
 from tests.kit.played_robot import RecordingRobot
 from tests.sparing_broker import SparingBroker
 from tests.support import Broker, until
+from tests.tcp_proxy import TcpProxy
 
 _numbers = itertools.count(1)
 
@@ -132,6 +133,18 @@ def test_a_stop_is_repeated_until_it_is_confirmed_although_nothing_can_be_printe
     assert robot.latched
 
 
+def test_a_slow_network_does_not_delay_repetitions(robot_on: Make, broker: Broker) -> None:
+    robot = robot_on("serial")
+    robot.deaf = True
+    with (
+        TcpProxy(broker.port, delay_s=0.2) as proxy,
+        running("estop", robot.id, f"--url=mqtt://127.0.0.1:{proxy.port}"),
+    ):
+        assert until(lambda: robot.count("estop") >= 2, 30)
+    first, second, *_ = robot.times("estop")
+    assert second - first < 1.7, "two seconds if it waited for its subscriptions"
+
+
 def test_no_robot_at_all_is_a_failure(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pebble.extensions.operator.client.estop.COLLECT_S", 0.5)
     empty = Broker(tmp_path)
@@ -196,6 +209,7 @@ KEPT = {
     "capabilities of a stranger": ("pebble/robots/attic", "capabilities", ("estop", "--all")),
     "a heartbeat of a stranger": ("pebble/robots/attic", "online", ("estop", "--all")),
     "its own capabilities, by name": ("", "capabilities", ("estop", "{id}")),
+    "a state that a stranger invents of it": ("", "estop/invented", ("estop", "{id}")),
     "capabilities of a stranger, on a page": ("pebble/robots/attic", "capabilities", ("page", "")),
     "capabilities of a stranger, in its status": ("pebble/robots/attic", "capabilities", ("estop", "status", "{id}")),
     "capabilities of a stranger, at its reset": ("pebble/robots/attic", "capabilities", ("estop", "reset", "{id}")),
@@ -289,6 +303,14 @@ def test_a_reset_shows_who_stopped_the_robot_and_frees_it(run: Run, robot_on: Ma
     assert run("estop", "reset", robot.id, url) == 0
     assert run.out == f"{robot.id}: free\n"
     assert robot.count("estop-reset") == 2
+
+
+def test_a_robot_called_reset_can_be_stopped(run: Run, robot_on: Make, url: str) -> None:
+    robot = robot_on("serial", id_="reset")
+    assert run("estop", robot.base, url) == 0
+    assert robot.latched
+    assert run("estop", "reset", robot.base, url) == 0
+    assert not robot.latched
 
 
 def test_over_a_thin_link_an_answer_may_take_longer(run: Run, robot_on: Make, url: str) -> None:

@@ -152,6 +152,7 @@ async def test_a_talk_ends_with_its_socket_and_after_a_second_without_sound(
 async def test_the_voice_goes_to_the_robots_own_topic_only() -> None:
     for named, topic in [
         (f"{REF}/incoming/voice", f"{REF}/incoming/voice"),
+        (f"{REF}/incoming/drive-values", UPLINK),
         ("pebble/robots/victim/incoming/audio-stream", UPLINK),
     ]:
         robot = SoundRobot({**AUDIO, "uplink_topic": named})

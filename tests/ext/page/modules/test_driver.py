@@ -268,6 +268,9 @@ SHOWN: Rows = {
         const worn = () => ({ ...pad(0, 8, 9), id: "worn" });
         show(worn(), real(0)); done.length = 0; show(worn(), real(0)); const held = stops();
         show(worn(), real(0, 8, 9)); result = [held, stops()];""", [[], ["estop: gamepad"]]),
+    "each of two stops before the rest of the page is here": ("""
+        driver.pads = null; show(pad(0, 8, 9), real(0)); done.length = 0;
+        show(pad(0, 8, 9), real(0, 8, 9)); result = stops();""", ["estop: gamepad"]),
     "a stop that is held for good is sent once: else no reset would last": ("""
         const worn = () => pad(0, 8, 9);
         pass(2500, worn()); time += 60_000; show(worn());

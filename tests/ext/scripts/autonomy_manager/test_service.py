@@ -83,6 +83,14 @@ def test_a_refused_start_leaves_the_running_script_alone(bench: Bench) -> None:
     assert walk.signals == []
 
 
+def test_nonsense_does_nothing(bench: Bench) -> None:
+    walk = bench.start("walk")
+    for body in ({"file": "sing"}, {"action": "dance"}, b"\xff", b"[" * 5000, 7, {"action": "stop", "config": 3}):
+        bench.command(body)
+    bench.quiet()
+    assert (walk.signals, bench.children.files) == ([], ["walk"])
+
+
 def test_stop_halts_the_wheels_and_the_run_that_has_ended_is_barred(bench: Bench) -> None:
     """Else a process that left the script's process group could drive on."""
     walk = bench.start("walk")

@@ -83,6 +83,13 @@ def test_a_script_that_does_not_look_ends_2_s_after_the_signal(station: Station)
     assert until(station.rests)
 
 
+def test_ctrl_c_ends_it_without_a_word(station: Station) -> None:
+    script = station.driven("robot.drive(z=0.5)\nrobot.sleep(60)")
+    script.send_signal(signal.SIGINT)
+    assert ended(script) == (130, "")
+    assert until(station.rests)
+
+
 def test_a_fork_is_no_script(station: Station) -> None:
     """A signal to it does not end the script, and it cannot drive."""
     body = """
