@@ -33,7 +33,10 @@ class Lease:
         self._held = False  # in the last 5 s the holder moved something: others have to ask
 
     def hold(self, client: tuple, ms: int, urgent: bool, now: int) -> None:
-        """Give control, renew it, or note the request for it while another client drives; ``urgent``: not then."""
+        """Give control, renew it, or note the request for it while another client drives.
+
+        ``urgent``: the client gets control at once, also while another one drives.
+        """
         self.tick(now)
         ms = min(max(ms, 1000), 10_000)
         if client[:2] == self.holder[:2]:

@@ -88,6 +88,7 @@ class RetainedTopics:
             self._begin_restarted()
             self._sides[side].arrived()
             for to, topic, payload in self._reconciliation.synchronize(side):
+                # Observers get the value that counts: none where the bounded table had no room to keep this payload.
                 subject, newest = self._subjects[topic], self._reconciliation.value(topic)
                 if subject is not None and newest is not None:
                     self._on_value(subject, newest)
@@ -153,6 +154,7 @@ class RetainedTopics:
         return source.window.may_be_old(message) and not self._reconciliation.has_received(source.side, message.topic)
 
     def _begin_restarted(self) -> None:
+        """Forget what a side has sent if its connection was lost since: its retained messages come again."""
         for state in self._sides.values():
             if state.restarted:
                 state.restarted = False

@@ -1,4 +1,8 @@
-"""Routing of messages between a robot's own transport and another one: a pure function of a table."""
+"""Routing of messages between a robot's own transport and another one: a pure function of a table.
+
+While *mirroring* is on (the flag remote-mirror), the bridge also sends operators the commands and feeds that
+programs on the robot publish.
+"""
 
 from __future__ import annotations
 

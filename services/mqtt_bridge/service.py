@@ -209,6 +209,7 @@ class MqttBridge(ForwardingService):
         self._leftover_timer = self.call_at(self.clock() + wait_s, then)
 
     def _remove_leftovers(self) -> None:
+        """Remove the retained topics that only the remote broker has; look later if nothing can be forwarded now."""
         if self.forwarder.gate is not Gate.OPEN or not self._same_broker.both_connected:
             self._look_later()
             return
@@ -395,7 +396,8 @@ class MqttBridge(ForwardingService):
     def _pass_stop(self, message: Message) -> None:
         """Forward a stop of the stops' own connection.
 
-        While mirroring is on, forward none: the stops of the robot's own programs are mirrored, and come back on it.
+        While mirroring is on, forward none. The bridge then sends the stops of the robot's own programs to the remote
+        broker, and this connection, which is another client there, receives them again: the robot would get its own.
         """
         if not self.forwarder.mirroring.on:
             self._receive_stop(message)

@@ -167,10 +167,11 @@ class Dialler:
         return self.loses_large
 
     def is_gone(self, lost: Lost, *, connected: bool, was_ended: bool) -> bool:
-        """True if the broker has ended, by this loss and the earlier verdict ``was_ended``.
+        """True if the broker's process seems to have ended. ``was_ended``: the result after the loss before this one.
 
-        The loss of a connection means it, unless the broker was only silent: it may be we who stood still. A failed
-        attempt keeps the verdict while nothing listens there and for `_ENDING_S` after that, and then revokes it.
+        1. A connection was lost (``connected``): True, unless the broker was only silent. It may be we who stood still.
+        2. An attempt to connect has failed: ``was_ended`` still while nothing listens there, and until `_ENDING_S`
+           after that or after the loss. Later, or if the broker was silent: False.
         """
         now, was_silent = time.monotonic(), isinstance(lost, Silent)
         if connected:

@@ -144,6 +144,8 @@ class InFlightTable:
         self._requests: dict[int, tuple[PendingAck, Sequence[str]]] = {}  # unanswered, with the filters of a SUBSCRIBE
         self.answered: list[PendingAck] = []  # and not completed yet
         self._pings: deque[_Ping] = deque()  # unanswered, oldest first
+        # A broker may hang up because a message is forbidden or too large. If it answers a ping, it has accepted all
+        # messages before it: only one on another topic, or a larger one, may be the reason for a later loss.
         # By topic: when its largest message was written, and the bytes of that message.
         self._accepted: dict[str, tuple[float, int]] = {}  # of messages before an answered ping
         self._written: dict[str, tuple[float, int]] = {}  # of messages since the newest ping, if larger than accepted

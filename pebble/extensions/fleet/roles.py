@@ -224,28 +224,41 @@ def _overlap(filter_: str, other: str) -> bool:
 
 
 def _of_bases(name: str, account: Account, *, at_hub: bool) -> Iterator[Rule]:
-    """Yield the rules of an account for its bases: of a robot, a neighbour or a gateway.
+    """Yield the rules that an account has for its bases, as a neighbour, a robot, a gateway of boards or a gateway.
 
     ``at_hub``: for the hub of a LAN; else for the operators' broker.
     """
+    roles = account.roles
     for base in account.bases:
-        if ProgramRole.NEIGHBOUR in account.roles:
-            if at_hub:
+        if ProgramRole.NEIGHBOUR in roles:
+            if at_hub:  # neighbours meet only there
                 yield from _of_neighbour(base)
-        elif ProgramRole.ROBOT in account.roles or ProgramRole.BOARDS in account.roles:
-            if at_hub and ProgramRole.BOARDS in account.roles:
-                return  # its robots are at a broker
+        elif ProgramRole.BOARDS in roles and at_hub:
+            continue  # no rule, as the robots that it carries are at a broker
+        elif ProgramRole.BOARDS in roles or ProgramRole.ROBOT in roles:
             yield from (Rule(access, f"{base}/#") for access in ("read", "write"))
-            if ProgramRole.ROBOT in account.roles and not at_hub:
-                yield Rule("write", f"{c.SHORT}{name}")  # in place of its base, over a thin link
-        else:  # a gateway: at a broker it publishes for the robot, at a hub for the robot's operators
-            yield from (Rule("read", f"{base}/{direction}/#") for direction in (INCOMING, OUTGOING))
-            yield Rule("write", f"{base}/{INCOMING if at_hub else OUTGOING}/#")
-            # It keeps the flags of both sides equal.
-            yield from (Rule("write", channel.filter(base)) for channel in c.CHANNELS if channel.kind is Kind.FLAG)
-    if ProgramRole.GATEWAY in account.roles and not at_hub:
-        yield Rule("read", c.ONLINE.filter(f"+/{GATEWAYS}/+"))
-        yield Rule("write", c.ONLINE.filter(f"+/{GATEWAYS}/{name}"))
+            if ProgramRole.ROBOT in roles and not at_hub:
+                yield Rule("write", f"{c.SHORT}{name}")  # its streams in groups, over a thin link: in place of its base
+        else:
+            yield from _of_gateway(base, at_hub=at_hub)
+    if ProgramRole.GATEWAY in roles and not at_hub:
+        yield from _of_gateway_heartbeats(name)
+
+
+def _of_gateway(base: str, *, at_hub: bool) -> Iterator[Rule]:
+    """Yield the rules of a gateway for a robot that it carries.
+
+    At a broker it publishes for the robot, at a hub for the robot's operators. It keeps the flags of both sides equal.
+    """
+    yield from (Rule("read", f"{base}/{direction}/#") for direction in (INCOMING, OUTGOING))
+    yield Rule("write", f"{base}/{INCOMING if at_hub else OUTGOING}/#")
+    yield from (Rule("write", channel.filter(base)) for channel in c.CHANNELS if channel.kind is Kind.FLAG)
+
+
+def _of_gateway_heartbeats(name: str) -> Iterator[Rule]:
+    """Yield the rules of a gateway for heartbeats: it publishes its own, and reads those of all gateways."""
+    yield Rule("read", c.ONLINE.filter(f"+/{GATEWAYS}/+"))
+    yield Rule("write", c.ONLINE.filter(f"+/{GATEWAYS}/{name}"))
 
 
 def _of_neighbour(base: str) -> Iterator[Rule]:

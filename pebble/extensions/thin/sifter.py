@@ -1,6 +1,8 @@
 """Sends messages that leave a robot through a sieve, while the link to its remote side is not wide.
 
-With an expander behind the remote broker, streams leave in groups instead: one message has the newest of each.
+The sieve keeps the newest message of each topic until the link has room for it. An expander is a program beside the
+remote broker that takes groups of streams apart. While there is one, streams leave in such groups instead: one message
+has the newest of each.
 """
 
 import threading
@@ -55,7 +57,11 @@ class Sifter:
     def _sift(
         self, source: SideState, subject: Subject, message: Message, forward: Forward, account: str
     ) -> Forward | Drop:
-        """Send a message that may be forwarded, or keep it, in the sieve or for the next group, and return NO_ROOM."""
+        """Send a message that may be forwarded, or keep it: in the sieve, or for the next group of streams.
+
+        Return NO_ROOM for one that is kept, as it is not forwarded yet. For the others return the result of
+        :meth:`Forwarder.pass_now`: how it was forwarded, or why not. An expander's announcement stays here.
+        """
         if source.side is not Side.LOCAL or subject.prompt:
             if self._groups is not None and subject.channel is EXPANDER:
                 self._groups.heard(message.payload)  # an announcement for the bridge itself

@@ -314,22 +314,31 @@ def _why(robot: RobotStop) -> str:
 
 
 def _reset(target: Target) -> int:
-    """Show the robot's stops, ask, reset them, and wait for the answer."""
-    with connected(target) as (transport, names), listening(target, transport) as second:
+    """Show the robot's stops, ask, reset them, and wait for the answer.
+
+    Messages of the robot come on a connection of their own if possible, so that they do not delay the reset.
+    """
+    with connected(target) as (transport, names), listening(target, transport) as receiving:
         view, name = RobotView(names.base), shown(id_of(names.base))
         robot = view.estop
-        put_account_into_topics(transport, names, lambda base: base == robot.base and robot.named)
-        robot.subscribe(second)
+
+        def is_named(base: str) -> bool:
+            """True if it is this robot, and it takes commands only at topics with the sender's name."""
+            return base == robot.base and robot.named
+
+        put_account_into_topics(transport, names, is_named)
+        robot.subscribe(receiving)
         # for ``view.pace``; the times of arrival do not matter
-        second.subscribe(LINK.topic(robot.base), lambda message: view.receive(LINK, message, 0.0, 0.0), direct=True)
+        receiving.subscribe(LINK.topic(robot.base), lambda message: view.receive(LINK, message, 0.0, 0.0), direct=True)
         wait_for(lambda: robot.has_capabilities, _ANSWER_S)
-        second.ask(robot.missing)  # the capabilities may have come after the subscription
+        receiving.ask(robot.missing)  # the capabilities may have come after the subscription
         wait_for(lambda: not robot.missing, _ANSWER_S)
         if not robot.states:
             raise PebbleError(f"{name} publishes no emergency stop: {_absent(robot)}")
         reset = Reset(robot, me(names.account))
         _print_states(robot)
-        if not reset.shown:
+        stops_to_reset = reset.shown  # those that are printed here, and no later ones
+        if not stops_to_reset:
             return 0
         if sys.stdin.isatty() and not typer.confirm(f"Let {name} move again?"):
             return 1

@@ -24,23 +24,26 @@ class ViewerRequest:
 
     Subscribe to ``flag_topic`` and ``media_topic``, pass what arrives to :meth:`receive`, and publish the other
     methods' messages by :func:`send`. A medium that was running before stays, and a flag that another operator lowers
-    stays lowered. With ``shares``, subscribe to ``control_topic`` as well: a stream that others use keeps its encoding,
-    and is left to them at the end.
+    stays lowered. A medium is running if a payload of it has arrived.
+
+    With ``shares``, subscribe to ``control_topic`` as well: a stream that others use keeps its encoding, and is left
+    to them at the end.
     """
 
     def __init__(self, base: str, medium: Medium, capabilities: dict[str, Any], *, shares: bool = False) -> None:
-        self._shares = shares
+        self._shares = shares  # the medium with other clients, whose encoding stays
         self.sent: deque[bytes] = deque(maxlen=_SENT)  # this client's requests, which come back on their topic
         self._others: MediaRequest | None = None  # what other clients request; None: nothing, as far as is known
-        self.settled = False  # it was sent, or need not be sent. Until then call :meth:`tick` often
+        self.settled = False  # the first request was sent, or need not be sent. Until then call :meth:`tick` often
         topics = (topic_of(base, capabilities, channel) for channel in CHANNELS[medium])
         self.media_topic, self.control_topic, self.flag_topic = topics
         self.section: dict[str, Any] = capabilities.get(medium) or {}  # of the newest capabilities
         self._base, self._medium = base, medium
         _, self._control, self._flag = CHANNELS[medium]
         self._encoding: str | None = None  # as wanted here; None: as configured
-        self._is_up: bool | None = None  # the flag; None: not known
-        self._raised = self._requested = False  # by this client
+        self._is_up: bool | None = None  # the flag that allows the medium; None: not known
+        self._raised = False  # this client has raised the flag, so it lowers it at the end
+        self._requested = False  # this client has sent a request, so it withdraws it at the end
         self._began_at = self._sent_at = self._received_at = self._keyframe_at = float("-inf")
 
     def check(self, encoding: str | None) -> None:
@@ -89,7 +92,12 @@ class ViewerRequest:
                     self._others = request if request.enabled else None
 
     def tick(self, now: float) -> list[Message]:
-        """Return the messages to send now. A request without an answer is repeated."""
+        """Return the messages to send now.
+
+        First wait a moment (:meth:`_waits_s`) for a sign that the medium is running already. Then send nothing, unless
+        another encoding is wanted here and no other client uses the medium. Without a sign, raise the flag if it is
+        down, and send the request. From then on, repeat the request whenever no payload has come for a while.
+        """
         if self.settled:
             is_quiet = now - max(self._sent_at, self._received_at) > _REPEAT_S
             return [self._ask(now)] if is_quiet else []
