@@ -15,6 +15,7 @@ import pytest
 
 from pebble.config import load
 from pebble.config.secret_text import without_secrets
+from pebble.config.text_files import NotTextError, text_of
 from pebble.config.visible import shown
 from pebble.errors import ConfigError
 from pebble.runtime.parent import MaskingFormatter
@@ -170,6 +171,12 @@ def test_a_file_in_another_encoding_is_understood_or_named(tmp_path: Path, run: 
         assert expected in run.out + run.err
         assert ("röver" in run.out) is not bool(expected)
         assert "Traceback" not in run.err
+
+
+def test_a_sentence_repeats_no_byte_of_the_file() -> None:
+    with pytest.raises(NotTextError) as caught:
+        text_of(SECRET.encode() + b"\xff")
+    assert SECRET not in str(caught.value)
 
 
 def test_every_text_file_of_the_product_is_read_as_utf_8() -> None:

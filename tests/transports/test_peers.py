@@ -31,6 +31,13 @@ def test_newcomers_are_connected_to_at_once_and_waited_for_when_ready(tmp_path: 
     assert list(tmp_path.iterdir()) == []
 
 
+def test_what_is_no_lock_file_is_no_process(tmp_path: Path) -> None:
+    (tmp_path / "folder.seat").mkdir()
+    os.mkfifo(tmp_path / "pipe.seat")
+    (tmp_path / "link.seat").symlink_to(tmp_path / "nowhere")
+    assert PeerRegistry(tmp_path).sockets() == []
+
+
 def test_a_lock_has_one_owner_and_comes_back(tmp_path: Path) -> None:
     first = FileLock.take(tmp_path / "lock")
     assert first is not None
