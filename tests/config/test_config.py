@@ -249,7 +249,11 @@ class TestOverridePoints:
         assert only_problem(at(f"services.{path}", "other/#")).startswith(f"services.{path}: must be a topic")
         assert only_problem(at(f"services.{path}", "pebble/robots/goob/incoming/estop")).startswith(f"services.{path}")
 
-    @pytest.mark.parametrize("metric", ["incoming/estop-reset", "outgoing/estop/mcu", "incoming/control/take"])
+    @pytest.mark.parametrize(
+        "metric",
+        ["incoming/estop", "incoming/estop-reset", "outgoing/estop/mcu", "incoming/control", "incoming/control/take",
+         "outgoing/control/mcu"],
+    )  # fmt: skip
     def test_no_channel_takes_a_topic_of_an_emergency_stop_or_control_and_those_keep_theirs(self, metric: str) -> None:
         """Not even another robot's: the driver of this one would stop that one."""
         channel = channel_of(metric)

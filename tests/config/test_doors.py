@@ -99,6 +99,14 @@ def test_named_refuses_what_leads_past_the_bridge(change: dict[str, Any], refuse
     assert problems("login", change) == []
 
 
+def test_a_link_without_a_user_name_is_refused() -> None:
+    anonymous = GOOD | {
+        "services": {"mqtt_bridge": {"enabled": True, "remote_mqtt": {"host": "broker.lab", "tls": TLS}}}
+    }
+    with pytest.raises(ConfigError, match=f"{REMOTE}.username: is missing at security.level"):
+        parse(anonymous | at("security.level", "login"), folder=Path("/nowhere"), env={})
+
+
 def test_a_board_that_has_no_memory_for_tls_logs_in_without_it() -> None:
     board = {"robot": {"id": "benjr", "platform": "esp8266"}, "local_mqtt": {"host": "broker.lab", "username": "benjr"}}
     config = parse(board | at("security.level", "login"), folder=Path("/nowhere"), env={})
@@ -132,6 +140,8 @@ def test_a_robot_that_asks_for_no_name_is_warned_of_once(change: dict[str, Any],
     ("security", "unnamed"),
     [
         ({}, "free"),
+        ({"strangers": "drive"}, "drive"),
+        ({"level": "login"}, "free"),
         ({"level": "login", "strangers": "drive"}, "drive"),
         ({"level": "named"}, "refuse"),
         ({"level": "named", "strangers": "free"}, "free"),
@@ -161,6 +171,7 @@ LOCAL = {"username": "ann", "password": "hunter2"}
         ({"local_mqtt": LOCAL}, True),
         ({"services": {"av_daemon": {"video": {"device": "rtsp://me:pw@cam.example/"}}}}, True),
         ({"services": {"mqtt_bridge": {"reboot_control": {"env": {"API_KEY": "k"}}}}}, True),
+        ({"transport": {"kind": "x", "settings": {"token": "t"}}}, True),
         ({"local_mqtt": {"username": "ann", "password_env": "PW"}}, False),
     ],
 )

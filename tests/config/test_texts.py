@@ -16,6 +16,7 @@ from pebble.config import load, parse
 from pebble.config.hosts import HostError, broker_host, endpoint, name_of_page
 from pebble.config.raw import deep_merge
 from pebble.config.secret_text import without_secrets
+from pebble.config.text_files import NotTextError, text_of
 from pebble.config.visible import shown
 from pebble.errors import ConfigError, PebbleError
 from pebble.extensions.fleet.certificates import init
@@ -169,6 +170,12 @@ def test_a_file_in_another_encoding_is_understood_or_named(tmp_path: Path, run: 
         assert expected in run.out + run.err
         assert ("röver" in run.out) is not bool(expected)
         assert "Traceback" not in run.err
+
+
+def test_a_sentence_repeats_no_byte_of_the_file() -> None:
+    with pytest.raises(NotTextError) as caught:
+        text_of(SECRET.encode() + b"\xff")
+    assert SECRET not in str(caught.value)
 
 
 def test_every_text_file_of_the_product_is_read_as_utf_8() -> None:

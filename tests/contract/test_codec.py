@@ -68,6 +68,8 @@ SOUNDS: dict[bytes, dict[str, Any]] = {
     b'{"enabled": true, "file": "a.wav"}': {"enabled": True, "file": "a.wav"},
     b'{"value": true, "file": "a.wav"}': {"enabled": True, "file": "a.wav"},
     b'{"value": {"action": "play", "file": "b"}, "file": "a"}': {"action": "play", "file": "b"},
+    b'{"value": {"action": "play"}, "file": "a.wav"}': {"action": "play", "file": "a.wav"},
+    b'{"action": "stop", "timestamp": 1.5e9}': {"action": "stop"},
     b'{"action": "play", "file": "a.wav", "repeat": true}': {"action": "play", "file": "a.wav", "repeat": True},
     b'{"value": true, "file": "b", "repeat": 3}': {"enabled": True, "file": "b", "repeat": 3},
 }
@@ -86,16 +88,21 @@ MEANINGS: list[tuple[Channel, bytes, Any]] = [
     (c.DRIVE, b'{"z": "1", "key": "0badf00d", "t": 1, "group": true}', Drive(z=1, key="0badf00d", t=1, group=True)),
     (c.DRIVE, b'{"z": 1, "key": null, "t": -1, "by": 5, "group": "a"}', Drive(z=1)),
     (c.DRIVE, b'{"z": 0, "valid_ms": 0}', Drive(valid_ms=0)),
+    (c.DRIVE, b'{"z": 0, "key": 5}', Drive()),
+    (c.DRIVE, b'{"value": {"z": 1, "source": "autonomy", "run": 17}}', Drive(z=1, source="autonomy", run=17)),
+    (c.DRIVE, b'{"x": 123456789012345678901234567890}', Drive(x=1)),
     # brackets in strings and side by side are not depth
     (c.DRIVE, json.dumps({"x": 1, "k": '\\"[{' * 100, "wide": [[]] * 100}).encode(), Drive(x=1)),
     # lights are clamped, missing colours are dark, and what is no period is the usual one
     (c.LIGHTS_SOLID, b'{"b": 2, "g": -1}', LightsSolid(b=1.0, g=0.0, r=0.0)),
+    (c.LIGHTS_SOLID, b'{"value": {"r": 0.5}}', LightsSolid(r=0.5)),
     (c.LIGHTS_FLASH, b'{"b": 1, "period": 0}', LightsFlash(b=1.0, period=0.05)),
     (c.LIGHTS_FLASH, b'{"period": "3"}', LightsFlash(period=3.0)),
     (c.LIGHTS_FLASH, b'{"period": "fast"}', LightsFlash(period=2.0)),
     (c.LIGHTS_FLASH, b'{"period": [], "b": "no"}', LightsFlash(period=2.0)),
     # a soundboard command is a boolean or an object
     *((c.SOUNDBOARD_COMMAND, raw, SoundboardCommand(**fields)) for raw, fields in SOUNDS.items()),
+    (c.AUTONOMY_COMMAND, b"false", AutonomyCommand(enabled=False)),
     (c.AUTONOMY_COMMAND, FOLLOW, FOLLOWS),
     (c.AUTONOMY_COMMAND, b'{"value": ' + FOLLOW + b"}", FOLLOWS),
     (c.ESTOP_RESET, b'{"boot": "a1b2c3d4", "count": 3}', EstopReset(boot="a1b2c3d4", count=3)),
@@ -110,7 +117,9 @@ def test_a_payload_has_its_value(channel: Channel, raw: bytes, value: Any) -> No
 
 #: Payloads that mean nothing.
 REFUSALS: dict[Channel, list[bytes]] = {
-    c.DRIVE: [b"", b"[]", b'{"x": 1}}'],
+    c.REBOOT: [b"1", b'"true"', b"{}", b'{"value": 1}', b'{"enabled": "on"}', b'{"value": {"value": true}}', b"",
+               b"null", b"[true]", b'{"on": true}', b"TRUE", b"true false"],
+    c.DRIVE: [b"", b"null", b"[]", b"1", b"true", b'"x"', b'{"x": 1', b'{"x": 1}}'],
     c.LIGHTS_FLASH: [b'{"period": 1e999}', b'{"b": 1, "period": "inf"}', b"[1, 1, 1]", b'"1"'],
     c.SOUNDBOARD_COMMAND: [
         *(b'{"action": "play", "file": "a", "repeat": ' + number + b"}" for number in (b"-1", b'"yes"', b"0.5", b"[]")),
@@ -211,6 +220,8 @@ def test_bytes_without_a_payload_are_neither_empty_nor_a_bridges_probe(raw: byte
         (b"{}", "", "but nothing"),
         (b'{"' + b"k" * 60_000 + b'":1}', "", "'kkkk"),
         (b'{"x\\u0000":1,"\\u001b[2J":1}', "", r"'\x1b[2J'"),
+        (b'{"x":"' + b"9!" * 30_000 + b'"}', "", "x is '9!9!"),
+        (b'{"x":true}', "", "x is a boolean"),
         (b'{"x":"0,5","z":0.5}', "", "x is '0,5', which is no number: it counts as 0"),
         *(
             (raw, None, "")
@@ -302,6 +313,12 @@ def test_a_command_has_at_most_64_kb() -> None:
     assert "65537 bytes" in refused(c.DRIVE, fits.replace(b"aa", b"aaa", 1))
 
 
+def test_messages_of_a_robot_may_be_larger() -> None:
+    files = json.dumps({"files": ["a" * 100] * 1000, "timestamp": 1.0}).encode()
+    assert len(files) > 64 * 1024
+    assert len(codec.decode(c.SOUNDBOARD_FILES, files).files) == 1000
+
+
 # -- what we say
 
 
@@ -310,6 +327,7 @@ SIGNED = Drive(x=-0.25, z=0.625, source="autonomy", run=1_000_000, valid_ms=400)
 ENCODED: list[tuple[Channel, Any, bytes]] = [
     (c.AUDIO, bytearray(b"PBAT"), b"PBAT"),
     (c.ONLINE, Heartbeat(t=1, online=False), b'{"t":1,"online":false}'),
+    (c.MQTT_VIDEO, True, b'{"value":true}'),
     (c.CHARGING_LEVEL, ChargingLevel(value=7.4), b'{"value":7.4,"unit":"v"}'),
     (c.DRIVE, SIGNED, b'{"x":-0.25,"z":0.625,"y":0.0,"source":"autonomy","run":1000000,"valid_ms":400}'),
     (c.SOUNDBOARD_COMMAND, SoundboardCommand(repeat=2), b'{"action":null,"enabled":null,"file":null,"repeat":2}'),

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import socket
+import time
 from collections.abc import Callable, Iterator
+from threading import Event
 from types import SimpleNamespace
 from typing import Any
 
@@ -54,6 +56,23 @@ def names(monkeypatch: pytest.MonkeyPatch) -> Names:
         monkeypatch.setattr(socket, "getaddrinfo", resolve)
 
     return give
+
+
+def test_close_does_not_wait_for_a_resolver(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, go_on = Event(), Event()
+
+    def hang(*_: Any, **__: Any) -> None:
+        asked.set()
+        go_on.wait(10)
+        raise OSError("no answer")
+
+    monkeypatch.setattr(socket, "getaddrinfo", hang)
+    transport = create("mqtt", "tool", MqttSettings(host=NAME)).open(0.0)
+    assert asked.wait(5)
+    began = time.monotonic()
+    transport.close()
+    assert time.monotonic() - began < 1.0
+    go_on.set()
 
 
 def works(transport: Transport) -> bool:

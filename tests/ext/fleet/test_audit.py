@@ -61,6 +61,9 @@ def test_the_rows_of_one_robot_and_of_all(tmp_path: Path) -> None:
     assert until(lambda: len(log.read(9)) == 5)
     assert [row.detail for row in log.read(9, "goob")] == ["0", "2", "? '; DROP TABLE audit"]
     assert [row.detail for row in log.read(1, "goob")] == ["? '; DROP TABLE audit"]
+    log.write("stop", ref="x" * 100_000)
+    assert until(lambda: len(log.read(9)) == 6)
+    assert len(log.read(1)[0].ref) == 200
     log.close()
 
 

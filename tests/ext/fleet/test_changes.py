@@ -116,6 +116,16 @@ def test_a_change_while_mosquitto_is_down_counts_when_it_runs(broker: FleetBroke
     assert [_gets_in(broker, name) for name in ("zoe", "otto", "goob")] == [True, False, True]
 
 
+def test_a_password_survives_a_change_of_level(broker: FleetBroker) -> None:
+    broker.change(replace(broker.fleet, level="named"))
+    with broker.login("otto") as otto:
+        named = until(lambda: passes(broker, otto, "pebble/robots/goob/incoming/by/otto/drive-values"), 3)
+        assert (named, passes(broker, otto, DRIVE), passes(broker, otto, STOP)) == (True, False, True)
+    broker.change(replace(broker.fleet, plain=True))
+    with broker.login("otto") as otto:
+        assert until(lambda: passes(broker, otto, DRIVE), 3)
+
+
 # -- what a check finds
 
 

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
+import signal
 import tempfile
 import time
 from collections.abc import Iterator
@@ -64,7 +66,8 @@ class Hall(Gateways):
 
     def __init__(self, folder: Path, stack: ExitStack) -> None:
         super().__init__(folder, stack)
-        self._number = 0
+        self.number = 0
+        self.sent: dict[int, float] = {}
         self.robot = stack.enter_context(self.client("r0"))
         self.received: list[int] = []
         self.stops: list[float] = []
@@ -78,12 +81,13 @@ class Hall(Gateways):
 
     def drives(self) -> bool:
         """Send a heartbeat and a command; True if the robot gets that."""
-        self._number += 1
+        self.number += 1
+        self.sent[self.number] = time.monotonic()
         heartbeat = json.dumps({"t": int(time.time() * 1000)}).encode()
         self.robot.publish(ONLINE.topic(ROBOT), heartbeat, qos=QoS.DELIVERED, retain=True)
-        command = json.dumps({"x": 0.5, "z": 0.0, "n": self._number}).encode()
+        command = json.dumps({"x": 0.5, "z": 0.0, "n": self.number}).encode()
         self.operator.publish(DRIVE.topic(ROBOT), command, qos=QoS.DELIVERED)
-        return until(lambda: self._number in self.received, 0.25)
+        return until(lambda: self.number in self.received, 0.25)
 
     def _on_drive(self, message: Message) -> None:
         if message.payload.strip():  # else a probe for cycles
@@ -115,6 +119,23 @@ def test_a_second_one_does_not_start_and_takes_over_where_it_is_tried_again(hall
     again = hall.gate("gate-1")
     assert until(lambda: hall.drives() and again.poll() == 1, SECOND_S)
     assert hall.received == sorted(set(hall.received)), "none came twice, or after a newer one"
+
+
+def test_what_waited_for_a_gateway_that_stood_still_is_too_old(hall: Hall) -> None:
+    assert until(hall.drives, 60), hall.gateway.printed
+    os.kill(hall.gateway.pid, signal.SIGSTOP)
+    first, stood = hall.number + 1, time.monotonic()
+    while time.monotonic() < stood + 2.0:
+        hall.drives()
+    old = {number for number in range(first, hall.number + 1) if time.monotonic() - hall.sent[number] > 1.0}
+    os.kill(hall.gateway.pid, signal.SIGCONT)
+    assert until(hall.drives, 30)
+    assert old
+    assert not old & {*hall.received}
+    stopped = time.monotonic()
+    hall.operator.publish(ESTOP.topic(ROBOT), b'{"stop": "0123456789abcdef"}', qos=QoS.DELIVERED, urgent=True)
+    assert until(lambda: hall.stops, 10)
+    assert hall.stops[0] - stopped <= STOP_S
 
 
 LAMP = "pebble/robots/minilamp"

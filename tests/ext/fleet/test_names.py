@@ -110,6 +110,7 @@ class TestWithoutName:
             ("drive-values", '{"value":{"x":"0"}}', "refuse", '{"value":{"x":"0","by":"-"}}'),
             ("drive-values", '{"z":0.001}', "refuse", None),
             ("drive-values", "nothing", "refuse", None),
+            ("control", '{"id":"3f2a91c0","by":"ann"}', "free", '{"id":"3f2a91c0","by":"-"}'),
             ("control", '{"id":"3f2a91c0","want":"release"}', "refuse", None),
             ("estop", '{"by":"otto"}', "refuse", '{"by":"otto?"}'),
             ("estop", '{"by":"otto?","value":{"by":"otto??"}}', "free", '{"by":"otto?","value":{"by":"otto?"}}'),
@@ -118,6 +119,7 @@ class TestWithoutName:
             *((f"{names}estop", '{"by":"ann"}', "refuse", '{"by":"ann?"}')
               for names in ("by/Ann/", "by//", "by/-/", "by/ann/by/otto/", f"by/{'a' * 33}/")),
             ("by/Ann/drive-values", '{"z":0}', "drive", None),
+            ("by/Ann/mcu/u1/estop", "{}", "drive", None),
             ("estop-reset", '{"boot":"a","count":1}', "drive", None),
             ("arm/wave", '{"z":0}', "drive", None),
         ],

@@ -167,6 +167,17 @@ def test_a_disk_that_is_full_leaves_the_log_whole(
     assert caplog.text.count(DISK_IS_FULL) == 1
 
 
+def test_half_a_line_is_left_to_itself(log: Log) -> None:
+    assert until(log.path.exists)
+    with log.path.open("ab") as file:
+        file.write(b'{"t":4')
+    log.audit.note("stop")
+    log.audit.close()
+    lines = log.path.read_bytes().splitlines()
+    assert lines[1] == b'{"t":4'
+    assert json.loads(lines[2])["what"] == "stop"
+
+
 def test_a_bridge_notes_what_passes_and_a_command_prints_it(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

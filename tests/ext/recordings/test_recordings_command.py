@@ -80,6 +80,14 @@ def test_an_import_in_another_order_is_read_in_that_of_time(tmp_path: Path, run:
     assert read == sorted(number * 10**9 for number in numbers)
 
 
+def test_one_robot_is_deleted(folder: Path, run: Run) -> None:
+    assert run("recordings", "rm", folder, "--robot", "fred", "--yes") == 0
+    assert run.out == "100 messages deleted\n"
+    assert messages(folder) == 101
+    assert run("recordings", "info", folder) == 0
+    assert "fred" not in run.out
+
+
 def test_what_a_recorder_uses_is_left_alone(folder: Path, run: Run) -> None:
     recorder = Recorder(folder, Options(free_bytes=0))
     recorder.start()

@@ -124,6 +124,7 @@ def test_a_retained_group_is_stale(start: Start) -> None:
     ("suffix", "payload", "passes"),
     [
         (DRIVE, b'{"z": 0.5, "group": true}', False),
+        ("incoming/lights-solid", b'{"r": 1, "group": true}', False),
         (DRIVE, b'{"z": 0, "group": true}', True),
         (DRIVE, b'{"z": 0.5}', True),
         (SOUND, b'{"action": "stop", "group": true}', True),
@@ -170,6 +171,15 @@ def test_capabilities_list_what_a_robot_takes_in_a_group(serial: dict[str, Any],
 
 # -- what may be in one, and what its copies are
 
+
+def test_what_may_be_in_a_group_is_a_table() -> None:
+    """A member that is added must also be one that a driver may send by itself: pebble/extensions/fleet/roles.py."""
+    assert {channel.metric for channel in groups.MEMBERS} == {
+        "drive-values", "lights-solid", "lights-flash", "soundboard-command", "outlets/{outlet}/power",
+        "mcu/{uid}/{name}",
+    }  # fmt: skip
+
+
 ALL_MEMBERS = (
     b'{"drive-values": {"x": -0.25, "z": 0.5, "valid_ms": 400}, "lights-solid": {"r": 0.5},'
     b' "outlets/lamp/power": {"on": true}, "mcu/abc/arm": {"angle": 3}, "soundboard-command": {"action": "stop"}}'
@@ -203,7 +213,10 @@ def test_the_sender_is_in_each_member_and_no_claim() -> None:
         b'{"drive-values": {"z": 0.1}, "\\u0064rive-values": {"z": 0.9}, "lights-solid": {"r": 1}}',
         b'{"drive-values": {"z": 0.1, "\\u007a": 0.9}}',
         b'{"drive-values": {"z": 0.5}, "estop": {}}',
+        b'{"drive-values": {"z": 0.5}, "estop-reset": {"boot": "a", "count": 1}}',
         b'{"drive-values": {"z": 0.5}, "control/take": {"id": "0badf00d"}}',
+        b'{"drive-values": {"z": 0.5}, "group": {"lights-solid": {}}}',
+        b'{"drive-values": {"x": 1e999}, "lights-solid": {"r": 1}}',
         b'{"drive-values": {"z": 0.5}, "mcu/a/b/c": {}}',
         b'{"drive-values": {"z": 0.5}, "outlets/1/power": {"on": 1}}',
         b'{"drive-values": {"z": 0.5, "valid_ms": 0}, "lights-solid": {"r": 1}}',

@@ -161,7 +161,9 @@ def test_what_is_no_json_or_large_is_sent_by_itself(start: Start, payload: bytes
     assert world.remote.payloads(IMU) == [payload]
 
 
-@pytest.mark.parametrize("metric", ["estop/serial", "online", "group", "a/+", "front-camera"])
+@pytest.mark.parametrize(
+    "metric", ["estop/serial", "control/serial", "online", "status", "group", "a/+", "front-camera"]
+)
 def test_an_expander_publishes_nothing_but_streams(start: Start, metric: str) -> None:
     world = start()
     expander = Beside(world)

@@ -302,6 +302,13 @@ def test_newcomers_are_connected_to_at_once_and_waited_for_when_ready(tmp_path: 
     assert list(tmp_path.iterdir()) == []
 
 
+def test_what_is_no_lock_file_is_no_process(tmp_path: Path) -> None:
+    (tmp_path / "folder.seat").mkdir()
+    os.mkfifo(tmp_path / "pipe.seat")
+    (tmp_path / "link.seat").symlink_to(tmp_path / "nowhere")
+    assert PeerRegistry(tmp_path).sockets() == []
+
+
 def test_a_socket_path_that_is_too_long_is_an_error_that_names_the_setting(tmp_path: Path) -> None:
     longest = tmp_path / ("x" * (107 - len(f"{tmp_path}//12345678.sock")))
     prepare_run_dir(longest)

@@ -174,6 +174,7 @@ def test_a_player_that_is_not_installed_is_named_once(receive: Receive, operator
     ("security", "topics"),
     [
         ({}, ["audio-stream"]),
+        ({"level": "named"}, ["by/+/audio-stream"]),
         ({"level": "named", "strangers": "free"}, ["by/+/audio-stream", "audio-stream"]),
     ],
 )

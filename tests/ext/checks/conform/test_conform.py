@@ -52,6 +52,8 @@ LOOKS_S = 2.0
 #: The check that finds it, how that names it, and what is written into the robot's program, in place of what.
 VIOLATIONS = (
     ("heartbeat", "in the time of observation", "HEARTBEAT_MS = 250", "HEARTBEAT_MS = 5000"),
+    ("identity", "it calls itself", '"id": robot_id', '"id": "other"'),
+    ("own topics", "drive.topic is", '"controls": True', '"controls": True, "topic": "pebble/robots/other/incoming/x"'),
     ("clock", "3600 s ahead", "time.time_ns() // 1_000_000", "time.time_ns() // 1_000_000 + 3_600_000"),
     ("payloads", "online: Expected `int`", '"online", {"t": self.epoch_ms()}', '"online", {"t": str(self.epoch_ms())}'),
     (

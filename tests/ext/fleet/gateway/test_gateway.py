@@ -176,6 +176,27 @@ def test_what_passes_to_a_robot(alone: World, topic: str, payload: bytes, retain
     assert not any(one.retain or one.retain_requested for one in alone.robots[0].on(topic))
 
 
+def test_pictures_pass_while_they_are_allowed_until_an_operator_ends_them(alone: World) -> None:
+    (robot,), (operator,) = alone.robots, alone.operators
+
+    def passes() -> bool:
+        before = len(operator.on("outgoing/front-camera"))
+        robot.publish("outgoing/front-camera", b"picture", qos=0)
+        alone.run(0.1, sending=False)
+        return len(operator.on("outgoing/front-camera")) > before
+
+    def sends(topic: str, payload: bytes, *, retain: bool = False) -> bool:
+        operator.publish(topic, payload, retain=retain)
+        alone.run(0.1)
+        return passes()
+
+    assert not passes(), "the flag is not known"
+    assert sends("incoming/flags/mqtt-video", b"true", retain=True), "it is not known who has requested them"
+    assert not sends("incoming/front-camera", b'{"enabled": false}')
+    assert sends("incoming/front-camera", b'{"enabled": true}')
+    assert not sends("incoming/flags/mqtt-video", b"false", retain=True)
+
+
 def test_commands_of_the_hub_and_what_runs_there_do_not_reach_the_broker(alone: World) -> None:
     for topic in ("incoming/lights-solid", "incoming/estop", "incoming/flags/reboot"):
         alone.robots[0].publish(topic, b'{"hub": 1}')
@@ -297,6 +318,14 @@ def test_it_starts_once_the_first_has_gone(alone: World, name: str) -> None:
     alone.running[name] = Running(alone, name)
     alone.run(3)
     assert alone.all_pass()
+
+
+def test_gateways_of_other_robots_share_a_broker() -> None:
+    world = World(robots=(GOOB, FRED))
+    world.running = {"a": Running(world, "a", GOOB), "b": Running(world, "b", FRED)}
+    world.run(3)
+    assert [one.gateway.carries for one in world.running.values()] == [{GOOB}, {FRED}]
+    assert world.all_pass()
 
 
 @pytest.mark.parametrize("names", [("a", "b"), ("a", "a")])

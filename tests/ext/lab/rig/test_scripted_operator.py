@@ -112,6 +112,18 @@ def test_while_a_person_has_control_nothing_is_sent() -> None:
     assert given.keeping.owners[0].by == "ann"
 
 
+def test_a_person_who_asks_gets_control() -> None:
+    given = Given(CONTROL)
+    assert has_control(given)
+    given.person("control", ANN)
+    given.operator.command(Drive(z=0.5))
+    given.person("control", ANN)
+    assert given.keeping.owners[0].by == "ann"
+    sent = len(given.drives)
+    given.operator.command(Drive(z=0.5))
+    assert len(given.drives) == sent
+
+
 def test_a_stop_is_repeated_until_it_is_confirmed_and_reset_by_who_pressed_it() -> None:
     given = Given()
     given.operator.stop("a test")
@@ -126,3 +138,12 @@ def test_a_stop_is_repeated_until_it_is_confirmed_and_reset_by_who_pressed_it() 
     given.person("estop", {"stop": "00c0ffee00c0ffee", "by": "ann"})
     given.operator.reset()
     assert given.view.latched, "a person's stop is left to the person"
+
+
+def test_a_stop_of_a_person_is_left_to_the_person() -> None:
+    given = Given()
+    given.receive(given.latches.capabilities())
+    given.person("estop", {"stop": "00c0ffee00c0ffee", "by": "ann"})
+    given.operator.reset()
+    assert given.sent == []
+    assert given.view.latched
