@@ -124,6 +124,7 @@ def test_a_second_one_does_not_start_and_takes_over_where_it_is_tried_again(hall
 def test_what_waited_for_a_gateway_that_stood_still_is_too_old(hall: Hall) -> None:
     assert until(hall.drives, 60), hall.gateway.printed
     os.kill(hall.gateway.pid, signal.SIGSTOP)
+    time.sleep(0.2)  # until all its threads stand still
     first, stood = hall.number + 1, time.monotonic()
     while time.monotonic() < stood + 2.0:
         hall.drives()

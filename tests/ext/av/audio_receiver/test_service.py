@@ -125,7 +125,7 @@ def test_received_speech_is_played_and_garbage_and_retained_packets_are_not(
 ) -> None:
     packet = make_sound_encoder("pcm", rate=16000, channels=1).encode(bytes(640), 1000)[0]
     operator.send(packet, retain=True)
-    robot = receive(device="plug:x", latency_ms=300)
+    robot = receive(device="plug:x", latency_ms=600)
     for size in range(200):
         operator.send(bytes(range(256))[:size])
         operator.send(packet[:size])
