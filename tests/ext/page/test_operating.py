@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import time
 from collections.abc import Callable, Coroutine
 from typing import Any, cast
 
@@ -44,6 +45,8 @@ def test_a_page_that_reads_logs_receives_those_from_before_and_those_that_come(p
         return page.value(robot.base, "status", "value") == text
 
     page.send("watch", ref=robot.base)
+    assert until(lambda: logged("first"))
+    time.sleep(0.5)  # by then it has subscribed to the logs, too
     assert until(lambda: logged("first"))
     assert page.logs == []  # it has not asked
     page.send("read-logs", ref=robot.base, on=True)

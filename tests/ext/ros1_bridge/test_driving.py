@@ -144,7 +144,7 @@ def test_a_new_base_hears_a_zero_first_and_a_lock_while_it_is_stopped(husky: Hus
     husky.stop_it()
     husky.ros.kill("base")
     up = husky.ros.start_base()
-    assert until(lambda: husky.ros.locks(up), 5)
+    assert until(lambda: husky.ros.locks(up), 15)
     assert set(husky.ros.locks(up)) == {"True"}
     husky.ros.kill("base")
     assert until(lambda: husky.bridge.assess()[0] == "absent", 5)
@@ -152,7 +152,7 @@ def test_a_new_base_hears_a_zero_first_and_a_lock_while_it_is_stopped(husky: Hus
     husky.end()
     husky.start()
     up = husky.ros.start_base()
-    assert until(lambda: husky.ros.locks(up), 5), "an earlier life has locked it"
+    assert until(lambda: husky.ros.locks(up), 15), "an earlier life has locked it"
     assert set(husky.ros.locks(up)) == {"False"}
     husky.end()
     husky.ready()
