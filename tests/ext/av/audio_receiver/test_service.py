@@ -119,7 +119,7 @@ def receive(local: Broker, remote: Broker, recorder: Recorder) -> Iterator[Recei
         yield started
 
 
-@pytest.mark.alone  # what comes too late is not played
+@pytest.mark.solo  # what comes too late is not played
 def test_received_speech_is_played_and_garbage_and_retained_packets_are_not(
     receive: Receive, operator: Operator, recorder: Recorder
 ) -> None:
