@@ -12,7 +12,7 @@ help:
 	@echo "make demo              four simulated robots, on Zenoh, on MQTT and on MCUs, driven through a broker; Ctrl-C ends it"
 	@echo "make demo SECONDS=30   ends by itself; succeeds only if every robot moved, stopped and obeyed as it should"
 	@echo "make demo PHONE=1      opens its page to the network, by https, with a login and a QR code"
-	@echo "make test              all checks and tests, some rows of each rule, some seven minutes; THOROUGH=1: all rows"
+	@echo "make test              all checks and tests, some rows of each rule, some six minutes; THOROUGH=1: all rows"
 	@echo "make test QUICK=1      what to run before each commit: lint, types, contract, bridge, transports, motion; a minute and a half"
 	@echo "make check             lint, types and imports only"
 	@echo "make docs              write build/docs: tables of all topics, config keys, web messages, words and bounds; schemas"
