@@ -1,4 +1,4 @@
-"""What each security level refuses in a config; warnings of a robot without logins and of secrets others can read."""
+"""Refusals of each security level in a config; warnings of a robot without logins and of secrets others can read."""
 
 from __future__ import annotations
 

@@ -226,18 +226,6 @@ class Machine:
     def sh(self, script: str, **options: Any) -> str:
         return self.run("sh", "-euc", script, **options)
 
-    def connect(self, other: int, own_address: str, address: str) -> None:
-        """Connect the machine by a cable to the network namespace of another process; each end gets an address."""
-        ends = (
-            (self._init, own_address, (f"link add eth0 type veth peer name eth0 netns {other}",)),
-            (other, address, ("link set lo up",)),
-        )
-        for pid, own, first in ends:
-            lines = (*first, f"address add {own}/24 dev eth0", "link set eth0 up")
-            enter = ["nsenter", "-t", str(pid), "-n", "ip", "-batch", "-"]
-            subprocess.run(enter, input="\n".join(lines).encode(), check=True, timeout=30)
-        self.run("ip", "route", "add", "default", "via", address)
-
     def succeeds(self, *words: str) -> bool:
         return subprocess.run(self.command(*words), capture_output=True, check=False, timeout=120).returncode == 0
 

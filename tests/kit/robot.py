@@ -10,7 +10,6 @@ import signal
 import sys
 import tempfile
 import threading
-import time
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -42,15 +41,10 @@ class Listener:
 
     def __init__(self, transport: Transport, base: str = BASE) -> None:
         self.received: list[Message] = []
-        self.at: list[float] = []
         self.base = base
         self.transport = transport.open(10)
         assert transport.state is State.CONNECTED, transport.problem
-        transport.subscribe(f"{base}/outgoing/#", self._receive, direct=True)
-
-    def _receive(self, message: Message) -> None:
-        self.at.append(time.monotonic())
-        self.received.append(message)
+        transport.subscribe(f"{base}/outgoing/#", self.received.append, direct=True)
 
     def on(self, metric: str) -> list[Message]:
         return [message for message in list(self.received) if message.topic == f"{self.base}/outgoing/{metric}"]
@@ -81,11 +75,6 @@ class Listener:
     def values(self, metric: str) -> list[Any]:
         """Return the ``value`` of each payload on this topic."""
         return [body["value"] for body in self.payloads(metric)]
-
-    def first(self, metric: str) -> float:
-        """Return the time at which the first message on this topic was received."""
-        pairs = zip(list(self.received), list(self.at), strict=False)
-        return next(at for message, at in pairs if message.topic == f"{self.base}/outgoing/{metric}")
 
     def newest_raw(self, metric: str) -> list[bytes]:
         """Return a list with the payload of the newest message on a topic; an empty list if it was cleared."""

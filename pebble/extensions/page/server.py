@@ -2,7 +2,6 @@
 
 import asyncio
 import logging
-import secrets
 import time
 from collections.abc import Coroutine
 from contextlib import suppress
@@ -13,7 +12,7 @@ from msgspec.structs import replace
 
 from pebble.config.security import SecurityLevel
 from pebble.contract import CAPABILITIES, CONTROL_STATE, ONLINE, channel_of
-from pebble.contract.identity import SERVERS, Identity, parse_topic
+from pebble.contract.identity import Identity, parse_topic
 from pebble.errors import ConfigError
 from pebble.extensions.fleet.audit import Audit
 from pebble.extensions.fleet.database import DatabaseError
@@ -53,7 +52,6 @@ class Server:
 
     def __init__(self, settings: WebSettings, people: People, audit: Audit) -> None:
         self.settings, self.people, self.audit = settings, people, audit
-        self._base = Identity("pebble", SERVERS, f"{settings.name}-{secrets.token_hex(2)}").base
         # The second one only publishes stops: no message that is received delays them.
         self.broker, self.stop_broker = (
             Broker(in_small_segments(settings.broker), name) for name in ("pebble-web", "pebble-web-stops")

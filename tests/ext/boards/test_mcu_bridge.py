@@ -124,7 +124,7 @@ def test_a_command_reaches_the_mcu_and_a_retained_one_is_refused(rig: SerialRig)
 
 
 def test_what_does_not_fit_never_reaches_the_mcu(memory_rig: SerialRig, caplog: pytest.LogCaptureFixture) -> None:
-    """What the board answers is logged, too."""
+    """Answers of the board are logged, too."""
     mcu, running = memory_rig.up(LAMP)
     caplog.set_level(logging.DEBUG)
     bad = [{"level": 10}, {"level": 200, "on": True}, {"level": 1, "on": 1}, [], None, b"\xff", b"[" * 40_000]

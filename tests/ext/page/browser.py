@@ -62,13 +62,13 @@ _FLAGS = (
 
 
 @contextmanager
-def chromium(*flags: str, program: str | None = None, beside: Browser | None = None) -> Iterator[Browser]:
-    """A headless browser with further ``flags``; another ``program`` may start it.
+def chromium(*flags: str, beside: Browser | None = None) -> Iterator[Browser]:
+    """Run a headless browser with further ``flags``.
 
     It may run ``beside`` another one: a thread has one Playwright. Skips the test without a Chromium, except where CI
     says it must be there.
     """
-    program = program or shutil.which("chromium")
+    program = shutil.which("chromium")
     if program is None:
         reason = "no Chromium: apt install chromium, or `sh tools/debian-packages.sh chromium=chromium`"
         (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(reason)

@@ -348,7 +348,7 @@ class Robot(ProgramRobot):
 
 @pytest.fixture(scope="module")
 def running(local: Broker) -> Iterator[Robot]:
-    """One robot for tests that leave it as it was."""
+    """Yield a robot for tests that leave it as it was."""
     with Robot("zenoh", local.port, SYNTHETIC) as robot:
         yield robot
 

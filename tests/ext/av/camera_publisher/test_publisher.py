@@ -278,7 +278,10 @@ def rate_of(pictures: list[Seen]) -> float:
 
 
 def are_what_was_captured(pictures: list[Seen], camera: Camera) -> bool:
-    """Those of full size: a machine that has too much to do reduces them until their number cannot be read."""
+    """True if the pictures of full size have the numbers that were captured.
+
+    A machine that has too much to do makes pictures smaller, until their number cannot be read.
+    """
     whole = [picture for picture in pictures if picture.shape == (240, 320, 3)]
     return bool(whole) and all(picture.number == camera.numbers[picture.captured_ms] for picture in whole)
 

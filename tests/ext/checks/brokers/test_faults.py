@@ -25,7 +25,10 @@ _LATE_S = 3.0
 
 
 class Fault:
-    """What passes on one connection: a packet becomes those that go on. ``ends``: what the broker gets at a loss."""
+    """A fault of a broker on one connection: each packet becomes those that go on.
+
+    ``ends``: the bytes that the broker gets when the connection is lost.
+    """
 
     ends = b""
     late_s = 0.0  # after which the broker notices a loss
@@ -53,7 +56,7 @@ class LateWills(Fault):
 
 
 class HidesRetained(Fault):
-    """What is retained looks live."""
+    """A broker whose retained messages look live."""
 
     def down(self, first: int, body: bytes) -> list[bytes]:
         return super().down(first & ~RETAIN if kind(first) == PUBLISH else first, body)
