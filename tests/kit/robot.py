@@ -10,6 +10,7 @@ import signal
 import sys
 import tempfile
 import threading
+import time
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -41,10 +42,15 @@ class Listener:
 
     def __init__(self, transport: Transport, base: str = BASE) -> None:
         self.received: list[Message] = []
+        self.at: list[float] = []
         self.base = base
         self.transport = transport.open(10)
         assert transport.state is State.CONNECTED, transport.problem
-        transport.subscribe(f"{base}/outgoing/#", self.received.append, direct=True)
+        transport.subscribe(f"{base}/outgoing/#", self._receive, direct=True)
+
+    def _receive(self, message: Message) -> None:
+        self.at.append(time.monotonic())
+        self.received.append(message)
 
     def on(self, metric: str) -> list[Message]:
         return [message for message in list(self.received) if message.topic == f"{self.base}/outgoing/{metric}"]
