@@ -12,7 +12,10 @@ HUB_PORT = 7447
 
 
 def of_broker(fleet: Fleet, name: str, secret: str, *, board: bool) -> dict[str, Any]:
-    """Return the part of a robot's config that connects it to the fleet's broker."""
+    """Return the part of a robot's config that connects it to the fleet's broker; ``secret``: its password.
+
+    ``board``: the robot is an MCU alone, whose only broker is ``local_mqtt``.
+    """
     server = fleet.brokers[0]
     login = {"host": server.host, "port": server.port, "username": name, "password": secret}
     link = login | {"tls": {"enabled": True, "ca_cert": certificates.CA_CERT}}
@@ -46,10 +49,10 @@ def hub_file(keys: str) -> dict[str, Any]:
 
 
 def boards_file(fleet: Fleet, name: str, below: str) -> dict[str, Any]:
-    """Return the config file of the gateway for boards whose account is ``name``.
+    """Return the config file of the gateway for boards whose account is ``name``; its password's file is beside it.
 
     At the LAN's hub the gateway connects for each board, by the board's account as a neighbour. ``below``: the prefix
-    in that file for paths in the fleet's folder.
+    in that file for paths of certificates, which are in the fleet's folder.
     """
     server, ca = fleet.brokers[0], below + certificates.CA_CERT
     login = {"username": name, "password_file": f"{name}-password", "tls": {"enabled": True, "ca_cert": ca}}
@@ -73,7 +76,7 @@ def _tls(ca: str, keys: str) -> dict[str, Any]:
 def _who(fleet: Fleet, name: str) -> dict[str, Any]:
     """Return the robot section and the security level of an account's config.
 
-    The base must belong to the account: messages below any other base would be dropped in silence.
+    The robot section names the account's base: messages below any other base would be dropped in silence.
     """
     account = fleet.accounts[name]
     parts = dict(zip(("system", "type", "id"), account.bases[0].split("/"), strict=True))

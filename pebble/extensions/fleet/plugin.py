@@ -48,6 +48,6 @@ def _left_out(fleet: Fleet, clients: dict[str, dict[str, Any]]) -> Iterator[str]
 
 
 def _gets_in(name: str, client: dict[str, Any]) -> bool:
-    """True if the plugin lets this account in, with its role and a password in the form of our files."""
+    """True if the plugin accepts this account's login and has its role, and the password has the form of our files."""
     has_role = any(role.get("rolename") == f"account-{name}" for role in client.get("roles", ()))
     return has_role and not client.get("disabled") and all(map(client.get, ("salt", "password", "iterations")))

@@ -238,7 +238,7 @@ def _of_bases(name: str, account: Account, *, at_hub: bool) -> Iterator[Rule]:
         elif ProgramRole.BOARDS in roles or ProgramRole.ROBOT in roles:
             yield from (Rule(access, f"{base}/#") for access in ("read", "write"))
             if ProgramRole.ROBOT in roles and not at_hub:
-                yield Rule("write", f"{c.SHORT}{name}")  # its streams in groups, over a thin link: in place of its base
+                yield Rule("write", f"{c.SHORT}{name}")  # a short topic for groups of streams on a thin link
         else:
             yield from _of_gateway(base, at_hub=at_hub)
     if ProgramRole.GATEWAY in roles and not at_hub:
@@ -299,7 +299,7 @@ def _of_rights(
                 yield Rule("write", f"{_ANY}/{INCOMING}/{BY}/{name}/{metric}")
             for base in bases_without_names:
                 yield Rule("write", f"{base}/{INCOMING}/{metric}")
-    if Right.DRIVE in held:  # for the check of an account, which publishes probes: programs ignore those
+    if Right.DRIVE in held:  # `pebble doctor` checks a page server's account by probes, which programs ignore
         yield Rule("write", c.BRIDGE_PROBE.filter(f"+/{SERVERS}/+"))
     if Right.EXPAND in held:
         yield from _of_expander()

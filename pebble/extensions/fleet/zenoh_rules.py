@@ -63,7 +63,7 @@ def _grants(name: str, held: Sequence[Rule], retains: Iterable[str], *, is_hub: 
     yield Grant(OUT, ("put",), reads)
     yield Grant(IN, ("declare_subscriber",), reads)
     yield Grant(IN, ("put",), (*writes, *_retained(_keys(retains))))
-    # Zenoh lets a declaration through only if the rule covers all that it asks for, here what local programs do.
+    # Zenoh lets a declaration out only if a rule covers its whole key; programs on the hub's machine may declare any.
     yield Grant(OUT, ("declare_subscriber",), ("**", f"{wire.RETAINED}**"))
     for keys in (retained, greetings, retained_counts):
         yield Grant(IN, ("query",), keys)
