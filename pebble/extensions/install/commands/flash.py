@@ -83,7 +83,10 @@ def flash(
 
 
 def _target(robot: str, firmware: str | None) -> tuple[Firmware, Config | None]:
-    """Return the firmware, and the config if one was given; for a robot with Wi-Fi else the one that Pebble has."""
+    """Return the firmware, and the config: the file ``robot``, or for a firmware's name the one that Pebble has.
+
+    None for the name of a firmware without Wi-Fi, which needs no config.
+    """
     if robot in FIRMWARE:
         target = firmware_named(firmware or robot)
         shipped = Path(str(files("pebble")), "configs", f"{robot}.json")

@@ -62,7 +62,7 @@ class Answers(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
     @property
     def account(self) -> str:
-        """Account of the robot at its broker. Its own broker knows it by its name."""
+        """Account of the robot at its broker: as answered, else the robot's id in the characters of account names."""
         return self.broker_user or re.sub(r"[^a-z0-9_-]", "-", str(self.id).lower()).lstrip("-")[:32] or "robot"
 
     @property

@@ -57,7 +57,8 @@ def restore(system: System, file: Path, agree: Callable[[Sequence[str]], None]) 
                 why = "is there already, with other content: only a blank machine becomes this robot"
                 raise SetupError(f"{target} {why}")
     scripts = (f"/{name}" for name in files if name.endswith(_SCRIPT))
-    if foreign := [*_foreign(plain(decode(text_of(files[config].content), config), Notes())), *scripts]:
+    settings = plain(decode(text_of(files[config].content), config), Notes())  # flaws are reported when it is loaded
+    if foreign := [*_foreign(settings), *scripts]:
         agree(foreign)
     for place in {_place(name) for name in files}:
         system.owner(_PLACES[place][0])  # raises if there is no such user, as without mosquitto

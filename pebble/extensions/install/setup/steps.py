@@ -101,7 +101,7 @@ class Job:
 
     @property
     def needs_user(self) -> bool:
-        """True if the page gets a user."""
+        """True if setup adds a user of the page: if a name was answered, or the page has no user yet."""
         return bool(self.answers.page) and (self.answers.user is not None or not has_user(self.people))
 
     def with_answers(self, given: Mapping[str, Any], secrets: Secrets | None = None) -> "Job":
@@ -156,7 +156,7 @@ class Job:
                 yield self._new_password("password of the page at the robot's broker", page)
 
     def _new_password(self, what: str, file: Path, *, known: bool = True) -> Step:
-        """Return the step that writes a new password. ``known``: one in the file is of this broker, and stays."""
+        """Return the step that writes a new password. ``known``: a password in the file is this broker's, and stays."""
         write = partial(self.system.write, file)
         return Step(what, lambda: known and file.exists(), lambda: write(f"{new_password()}\n".encode()))
 

@@ -81,7 +81,7 @@ class System:
                 if fill is not None:
                     fill(new)
                 new.chmod(mode)
-                if ids is not None and is_root():  # last of all: then it is theirs
+                if ids is not None and is_root():  # last of all: from then on the owner may change what is in it
                     for path in (*new.iterdir(), new):
                         os.chown(path, *ids, follow_symlinks=False)
                 new.rename(folder)
