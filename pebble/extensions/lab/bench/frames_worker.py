@@ -118,7 +118,7 @@ class ZenohReader:
 
 
 def _refuse(problem: str) -> None:
-    """Raise TransportError: a frame that took another way would be counted for the wrong variant."""
+    """Raise TransportError if there is a problem: frames then take another way, and would count for this variant."""
     if problem:
         raise TransportError(problem)
 

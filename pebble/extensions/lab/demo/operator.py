@@ -299,7 +299,8 @@ class Operator:
 
         for driver in drivers:
             driver.stop("part of the demo")
-        with closing(self._transport.subscribe(ALL_OUTGOING, receive)):  # brings retained capabilities again
+        # A new subscription also brings the retained capabilities, which say whose confirmations a stop needs.
+        with closing(self._transport.subscribe(ALL_OUTGOING, receive)):
             while not all(driver.stopped for driver in drivers) and time.monotonic() < pressed + _CONFIRMED_S:
                 self._hold(_FORWARD, _AGAIN_S)  # in vain; each command also sends the stop again when that is due
         self._hold(_FORWARD, _IN_VAIN_S)  # after the confirmations: the motors must stay off
@@ -339,7 +340,7 @@ class Operator:
             self._begin("scripts", [robot])
             self._scripted = robot
             with suppress(EndedEarlyError):  # a person has taken it: go on with the next robot
-                self._wait(0.0)
+                self._wait(0.0)  # raises if a person has it already
                 self._follow(robot)
             self._scripted = None
             self._wait(0.0)  # raises if the demo ends

@@ -106,7 +106,7 @@ class Robot(SimulatedRobot):
         self.local_broker: Broker | None = None
         self.local_port: int | None = None  # of the local broker, which may be that of several robots
         self.reports, self._wrap = reports, wrap
-        self._started: list[Program] = []
+        self._started: list[Program] = []  # by ``start``: the launcher, or the programs in its place
         motors = {"serial": {"baud": 460_800}, "telemetry": {"publish_touch_sensors": reports}}
         self._services: dict[str, Config] = {"mqtt_bridge": {}, "serial_mcu_bridge": motors, **(services or {})}
         self._base_config: Config = {"robot": {"id": name}, "transport": {"kind": kind}}  # without services

@@ -44,7 +44,7 @@ class Surfaces:
 
     def __init__(self, world: World) -> None:
         self._world = world
-        self._margin = _modules(world) + 2  # modules with the white around them
+        self._modules_across = _modules(world) + 2  # of a tag with its white border
         self._textures: dict[int, tuple[Image, ...]] = {}
         self._fixed = [
             *(_left_side(wall, index) for index, wall in enumerate(world.room.walls if world.room else ())),
@@ -79,7 +79,7 @@ class Surfaces:
     def _tag(self, number: int, size: float, x: float, y: float, z: float, yaw: float) -> Surface:
         if number not in self._textures:
             self._textures[number] = _tag_textures(self._world.family, number)
-        half = size / 2 * self._margin / (self._margin - 2)
+        half = size / 2 * self._modules_across / (self._modules_across - 2)  # ``size`` is without the white border
         return Surface(*_edges(x, y, half, yaw), z - half, z + half, 2, textures=self._textures[number])
 
 

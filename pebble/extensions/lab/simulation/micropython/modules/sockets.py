@@ -185,7 +185,7 @@ class HostTcp(BoardSocket, Stream):
         if not self._network.radio.connected:
             return None
         if not self._established and not self.ready(POLLOUT):
-            # Before the connection is there, an ESP32 refuses data; an ESP8266 does not, but none is sent here yet.
+            # Before the connection is there, an ESP32 refuses data by an error, an ESP8266 does not. No data is sent.
             if self._network.radio.platform == "esp32":
                 raise failure(errno.EINPROGRESS)
             return None
