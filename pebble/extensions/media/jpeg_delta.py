@@ -43,7 +43,7 @@ class JpegDelta:
         reference = self._reference if self._chained else None
         self.keyframe = keyframe or reference is None or reference.shape != picture.shape
         self._since_keyframe = 0 if self.keyframe else self._since_keyframe + 1
-        # The next one is then a full picture, which builds on nothing: this one need not be decoded for it.
+        # The last picture before a full one need not be decoded, as a full picture builds on nothing.
         is_last = self._since_keyframe + 1 >= self._interval
         if self.keyframe or reference is None:
             jpeg = _jpeg(picture, quality)

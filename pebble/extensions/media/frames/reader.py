@@ -42,7 +42,7 @@ class FrameReader:
     Counters: received; missed (gaps in the numbers: lost, or overtaken by a newer one); skipped (replaced by a newer
     one before it was read); of the frames that were read: shared (through shared memory), copied (as bytes), torn
     (overwritten while they were copied); refused (not frames); writers (how many were seen; a restarted one counts
-    again); reopened (stopped using shared memory).
+    again); reopened (to begin or to stop using shared memory).
     """
 
     def __init__(self, folder: Path, stream: str, *, views: bool = False, sharing: bool = True, depth: int = 1) -> None:
