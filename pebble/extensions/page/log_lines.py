@@ -99,7 +99,7 @@ class LogReader:
 class Line(msgspec.Struct, omit_defaults=True):
     """A line in the form for pages. ``t``: epoch milliseconds.
 
-    Some robots send plain text, or fields with other names.
+    It is made of a robot's message, which may be plain text, or have fields with other names.
     """
 
     message: str

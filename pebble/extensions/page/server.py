@@ -56,7 +56,7 @@ class Server:
         self.broker, self.stop_broker = (
             Broker(in_small_segments(settings.broker), name) for name in ("pebble-web", "pebble-web-stops")
         )
-        self.robots, self.stops = Robots(), Stops(self._has_sent)
+        self.robots, self.stops = Robots(), Stops(self._may_repeat_stops)
         self.drivers = Drivers(self.broker, self.robots)
         self.media = Broker(settings.broker, "pebble-web-media")  # what it carries holds up no command
         self.pictures = MediaHub(self.media, self.robots)
@@ -127,7 +127,7 @@ class Server:
         self._send(self.stops.receive(message, clock()))
         if ref not in self.robots.components:
             return
-        # a heartbeat changes nothing about stops that is shown already
+        # a heartbeat changes no stop: it only brings the state of a robot's stop to pages that have none yet
         if address.metric != ONLINE.metric or self.robots.value(ref, _ESTOP_METRIC) is None:
             self.stops.changed.add(ref)
         if channel_of(f"outgoing/{address.metric}") in (CAPABILITIES, CONTROL_STATE):
@@ -175,10 +175,10 @@ class Server:
             heartbeats, self._heartbeats = self._heartbeats, None
             self.spawn(asyncio.to_thread(heartbeats.close))
 
-    def _has_sent(self) -> bool:
-        """True if few messages wait to be sent.
+    def _may_repeat_stops(self) -> bool:
+        """True if few messages of stops wait to be sent.
 
-        While many wait, repeating the stop of a thousand robots would only delay it.
+        While many wait, repeating those of a thousand robots would only delay them.
         """
         return self.stop_broker.transport.outgoing.waiting < _MANY_WAIT
 

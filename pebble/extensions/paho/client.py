@@ -22,7 +22,7 @@ _IN_FLIGHT = 65_535  # messages of QoS 1; their number is bounded by the connect
 
 
 class _Paho(paho.Client):
-    """A client of paho with pings of our own (its keepalive is too slow for T19), and limited queues."""
+    """A client of paho with limited queues and pings of our own: paho's keepalive notices a silence too late (T19)."""
 
     listener: Listener
     opening: Opening
@@ -100,7 +100,7 @@ class PahoClient:
         client.listener, client.opening = listener, opening
         client.connect_timeout = hosts.CONNECT_TIMEOUT_S
         if not self._modern:
-            client.max_inflight_messages_set(_IN_FLIGHT)  # on 5 the broker's Receive Maximum may be paho's 20
+            client.max_inflight_messages_set(_IN_FLIGHT)  # on MQTT 5 a broker may allow only paho's default, 20
             if bridge:
                 client.enable_bridge_mode()
         if settings.username is not None:

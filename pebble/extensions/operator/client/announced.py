@@ -23,8 +23,8 @@ _LARGEST = 4096  # bytes of a heartbeat or status that are looked at
 def announced(base: str, payload: bytes) -> dict[str, Any]:
     """Return the capabilities that follow from ``"subscribes": ["incoming/drive-values", …]``; empty without a list.
 
-    They contain ``announced``, so that people can be told what to publish. Complete topics and those of other
-    components are ignored.
+    Their ``announced`` is true: by it a page tells the robot's maker to publish capabilities. Whole topics in the list
+    are ignored, also the robot's own.
     """
     if len(payload) > _LARGEST or b'"subscribes"' not in payload:
         return {}

@@ -80,7 +80,7 @@ class Broker:
         #: True for the base topic of a robot that takes commands only with a name.
         self.is_named: Callable[[str], bool] = lambda _base: False
         self.names = NamedTopics(settings.username or "", lambda base: self.is_named(base))
-        self.transport.policy.forms = self.names.forms
+        self.transport.policy.forms = self.names.forms  # puts the account into the topics of commands to such a robot
 
     @property
     def loop(self) -> asyncio.AbstractEventLoop:

@@ -133,7 +133,7 @@ def put_account_into_topics(transport: Transport, names: Names, is_named: Callab
 
 def _of_config(config: Config, target: Target) -> tuple[str, Any, Names, str]:
     base = config.base if target.robot is None else base_of(target.robot)
-    addresses = Addresses(config) if base == config.base else None
+    addresses = Addresses(config) if base == config.base else None  # of another robot no renamed topics are known
     if target.remote:
         kind, settings = _remote(config, target.program)
         return kind, settings, Names(base, addresses, _account(settings)), f"the remote side of {config.base}"

@@ -131,13 +131,13 @@ class ControlClient:
         if self.held and state.id:  # it was taken over, or ended while this client was not heard
             self._give_up(f"{self.robot.who} has control now")
             return
-        if self.held:  # free: it has ended, or the motor owner was started again
+        if self.held:  # free: control has ended, or the motor owner was started again: request it anew, at once
             self._asked_at = self._answered_at = self._due_at = now
         self.held, self.decided = False, ""
         if state.asks_id:  # the robot answers: it asks the holder, for this client or for one before it
             self._answered_at = now
         has_another_owner = any(owner.id == self.id for owner in self.robot.states)
-        if state.id and has_another_owner:  # leave it to the client that has the deciding owner
+        if state.id and has_another_owner:  # another client has the deciding owner: first let it get all of them
             self._out = [self._message(CONTROL, want="release")]
             self._due_at = max(self._due_at, now + APART * self._pace_of().control_s)
 

@@ -94,7 +94,7 @@ def form(settings: Sequence[Setting]) -> list[dict[str, Any]]:
 def effective(settings: Sequence[Setting], wanted: Mapping[str, Any]) -> dict[str, Value]:
     """Return each setting's wanted value, or its default. Raises SettingError.
 
-    Unknown keys and paths are ignored.
+    Wanted values of unknown settings, and of settings that name a file, are ignored.
     """
     values: dict[str, Value] = {}
     for setting in settings:

@@ -78,7 +78,7 @@ class RobotEstop:
     def missing_control(self) -> list[str]:
         """Return the topics of the control states that are missing, if the robot publishes control.
 
-        The owners are those whose stop state is missing: a broker that keeps back one of the two keeps back both.
+        The owners are those whose stop state is missing: a broker keeps back both states of an owner, or none.
         """
         owners = [owner for owner in self.owners if owner not in self._states] if self.keeps_control else []
         return [CONTROL_STATE.topic(self.base, owner=owner) for owner in owners]
@@ -87,7 +87,7 @@ class RobotEstop:
     def old(self) -> bool:
         """True if the robot is known to have no emergency stop.
 
-        If its broker refuses the topics of the stop, its capabilities have a section that says "not available".
+        False if only its broker refuses the topics of the stop: then its capabilities list the stop as not available.
         """
         return self.has_capabilities and not self.announces
 

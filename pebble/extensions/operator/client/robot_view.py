@@ -43,7 +43,7 @@ class Liveness:
         """Note a heartbeat with the time ``t``, in milliseconds of the component's clock."""
         self._stamps.append(t)
         interval_s = None if self.received_at is None else now - self.received_at
-        # less than robots can be configured for: both waited in a queue; more: a pause, which is no interval
+        # shorter than any config allows: both heartbeats waited in a queue; longer: a pause, which is no interval
         if interval_s is not None and 0.05 <= interval_s <= 10.0:
             if not self.reported_offline and self.online_to_people(now) is False:  # people had seen it go
                 self._returns.append(now)

@@ -133,8 +133,8 @@ class DrivenRobot:
     def renew_key(self) -> None:
         """Choose a new key for a new connection to the broker.
 
-        Where no motor owner gives keys, the bridge judges a command's age by the earlier ones with its key. Those of
-        the old connection must not count.
+        Where no motor owner gives keys, the bridge judges a command's age by earlier commands with the same key, but
+        those of the old connection must not count.
         """
         self._key = secrets.token_hex(4)
 
@@ -170,7 +170,7 @@ class DrivenRobot:
         return self.tab is tab or tab in self._wishes
 
     def awaits(self, token: str, now: float) -> bool:
-        """True if a page with this token recently had control, and no client has it now; later calls return False."""
+        """True if control, which no client has now, waits for a page with this token. Asking ends the wait."""
         awaited, until = self._awaited
         if awaited != token:
             return False

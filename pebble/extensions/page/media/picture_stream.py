@@ -58,7 +58,7 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
         """Handle a page's answer to the frame ``seq``."""
         now = time.monotonic()
         frame = viewer.queue.acknowledge(seq, now)
-        if frame is not None or seq == NO_FRAME:
+        if frame is not None or seq == NO_FRAME:  # else an answer to a frame that was answered before, or never sent
             if answer == _KEY_FRAME_WANTED:
                 viewer.queue.note_keyframe_request(now)
             elif answer == _CANNOT_DECODE:

@@ -24,7 +24,7 @@ class Talk:
     def takes(self, piece: int, now: float) -> bool:
         """True if piece number ``piece`` of the microphone, from 0, is at most LATE_S later than the fastest one."""
         begun_at = now - piece / PIECES_PER_S  # when the page spoke piece 0, if this piece was not delayed
-        # With a slow microphone that time moves on with each piece, without any delay: _DRIFT_S lets it.
+        # A slow microphone moves that time on with each piece, although no piece is delayed: it may, by _DRIFT_S.
         self._begun_at = min(self._begun_at + _DRIFT_S, begun_at)
         if begun_at - self._begun_at > LATE_S:
             return False

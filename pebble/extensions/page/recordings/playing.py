@@ -113,7 +113,7 @@ class RobotSource:
         self._archive, self._ref, self._begins = archive, ref, begins
 
     def messages(self, since_ns: int, until_ns: int) -> Iterator[Recorded]:
-        """Yield the messages after ``since_ns`` up to the step of a second that contains ``until_ns``."""
+        """Yield the messages after ``since_ns``, read in steps of a second: some after ``until_ns`` may come, too."""
         next_ns: int | None = since_ns + 1
         while next_ns is not None and next_ns < until_ns:
             messages = self._archive.messages(self._ref, next_ns, next_ns + _STEP_NS)

@@ -341,7 +341,7 @@ def in_time_order(streams: Iterable[tuple[int, Callable[[], Iterator[Recorded]]]
     ``streams``: each with its first time and a function that opens it; it is opened when that time has come.
     """
     unopened = sorted(streams, key=lambda stream: stream[0], reverse=True)  # the earliest last
-    #: Of each open stream: the time of its next message, its number (of equal times the lower one is first), both.
+    #: Of each open stream: the next message's time, the stream's number (the lower is first), the message, the stream.
     heap: list[tuple[int, int, Recorded, Iterator[Recorded]]] = []
     opened = 0
     while unopened or heap:

@@ -116,7 +116,7 @@ def _copy(source: Path, part: Path, keeps: Keeps, *, complete: bool) -> Rewritte
             writer.metadata(DAMAGE, {MISSING: str(missing)})
         writer.finish()
         sync_file(out.fileno())
-    # Behind the last record there may be nothing, or what a kill leaves (both are `is_cut_off`): else it was not read.
+    # Behind the last record a kill leaves nothing, zeros or part of a record: `is_cut_off`. Other bytes were not read.
     is_whole = not (damage.parts or damage.missing or damage.unnamed) and is_cut_off
     return Rewritten(writer.messages, left_out, missing, damage.report(), is_whole)
 

@@ -72,7 +72,7 @@ class RecordingWriter:
         return number
 
     def add(self, channel: int, log_ns: int, payload: bytes, publish_ns: int = 0) -> None:
-        """Add a message that was received at ``log_ns``. Called for each message."""
+        """Add a message that was received at ``log_ns``. ``publish_ns``: its own stamp; 0: it has none."""
         number, self.messages = self.messages, self.messages + 1
         self._log_ns = log_ns
         self._used.add(channel)

@@ -99,7 +99,7 @@ class Finisher:
         self._event("damaged", file=path.name, why=why)
 
     def _later(self, path: Path, error: OSError) -> None:
-        """Leave a file as it is until there is room, still readable; log that once."""
+        """Leave a file unfinished until there is room, and log that once. It can be read meanwhile."""
         if path not in self._unfinished:
             log.warning("%s is not finished yet: %s", path.name, error.strerror or error)
         self._unfinished.add(path)

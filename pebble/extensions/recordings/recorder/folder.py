@@ -62,7 +62,7 @@ class Folder:
         self.is_locked = False  # also where there are no locks: another recorder may write here
         self._number = 0
         self._lock = ExitStack()
-        self._own = OwnFile(root / LOCK)
+        self._lock_file = OwnFile(root / LOCK)
 
     def take(self) -> None:
         """Create the folder and lock it against a second recorder. Raises RecordingError."""
@@ -72,7 +72,7 @@ class Folder:
             raise RecordingError(f"{self.root}: {error.strerror}: name another folder") from None
         problem = f"{self.root}: a recorder writes here: stop it first, or name another folder"
         self.is_locked = self._lock.enter_context(_locked(self.root / LOCK, problem))
-        self._own = OwnFile(self.root / LOCK)
+        self._lock_file = OwnFile(self.root / LOCK)  # the file that is locked now
         for path in self._files():
             if self.is_locked and _COPY.fullmatch(path.name):  # was being written when its process was killed
                 path.unlink(missing_ok=True)
@@ -81,7 +81,7 @@ class Folder:
     @property
     def in_place(self) -> bool:
         """True if the path still leads to the folder that was taken; its disk may have been removed or brought back."""
-        return self._own.in_place
+        return self._lock_file.in_place
 
     def release(self) -> None:
         self._lock.close()

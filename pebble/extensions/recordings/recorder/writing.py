@@ -206,7 +206,7 @@ class Writing:
         self._blocked = None
         for item in lacking:
             self.add(item)
-        if self._blocked is not None:  # it failed at once
+        if self._blocked is not None:  # it failed at once: the earlier block goes on
             self._blocked = blocked
             return
         self._finisher.retry()

@@ -50,8 +50,8 @@ class ViewerQueue:
         self.overflowed = False  # waiting because the page is too slow
         self.window = WINDOW  # so many frames may be under way
         self.ack_s = 0.0  # how long the last frame took to be drawn and acknowledged
-        self.late_acks = 0  # in a row; of frames that were under way together one counts
-        self._late_at = float("-inf")  # when the newest of them came
+        self.late_acks = 0  # in a row; frames that were under way together count once
+        self._late_at = float("-inf")  # when the newest was counted: frames sent before that do not count
         self._queue: deque[Frame] = deque()
         self._under_way: dict[int, tuple[float, Frame]] = {}  # by number: when it was sent, and the frame
         self._undecodable: set[str] = set()  # encodings that the page could not decode after all
@@ -109,7 +109,7 @@ class ViewerQueue:
         self.waiting = True
 
     def not_drawn(self) -> None:
-        """Skip frames up to the next key frame, unless one is on its way, because the page could not draw one."""
+        """Skip frames up to the next key frame, as the page could not draw one; not if that key frame is on its way."""
         frames_under_way = [frame for _, frame in self._under_way.values()]
         if not any(frame.keyframe for frame in (*frames_under_way, *self._queue)):
             self.wait_for_keyframe()
