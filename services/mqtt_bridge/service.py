@@ -229,7 +229,7 @@ class MqttBridge(ForwardingService):
         if self.forwarder.gate is not Gate.OPEN:
             self._check_brokers()
             return
-        self._same_broker.send()
+        self._same_broker.send()  # the new connection may lead to another broker
         if side is Side.REMOTE and epoch == self.epoch:
             self.subscribe_remote()
 
