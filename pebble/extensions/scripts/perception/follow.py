@@ -154,7 +154,7 @@ class Follower:
             return self._last  # it may be missing in a single picture
         self._holding = False
         if self._near and 0.0 < gone_s - settings.tag_timeout_s <= _AWAY_S:
-            return Command(0.0, -_AWAY_POWER, "back away")
+            return Command(0.0, -_AWAY_POWER, "back away")  # it was so near that it has outgrown the picture
         if gone_s <= settings.lost_timeout_s:
             return Command(reason="wait")
         return self._search(now)
