@@ -48,6 +48,7 @@ def main() -> int:
     """Build the site; return Sphinx' exit code."""
     shutil.rmtree(SOURCE, ignore_errors=True)
     shutil.copytree(ROOT / "docs", SOURCE, ignore=shutil.ignore_patterns("README.md"))
+    # By file or folder of the repository: its page.
     pages = {ROOT / "docs" / path.relative_to(SOURCE): path for path in SOURCE.rglob("*") if path.is_file()}
     pages |= {ROOT / name: SOURCE / place for name, place in BESIDE.items()}
     pages[ROOT / "docs/README.md"] = SOURCE / "reading.md"

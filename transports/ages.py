@@ -89,7 +89,7 @@ class SenderClocks(Generic[K]):
                 clock = self._clock_to_use(key, clock, sent, now, late_s)
             if waited_s <= late_s:
                 clock.proved = max(clock.proved, now - sent - waited_s)
-            # Without delay the difference is from `proved` to `least`: by the smaller one an age is rather too great.
+            # The difference without delay is between `proved` and `least`. The smaller makes an age rather too long.
             age = now - sent - min(clock.least, clock.proved)
             return age if now - clock.began >= _YOUNG_S else max(age, waited_s)
 

@@ -101,10 +101,10 @@ class Cycles:
             way, now = self._ways.get((side, topic)) or self._way(side, topic), self._clock()
             count = way.count(payload, now)
             if way.closed:
-                is_recognised = subject.runs or not is_one_shot  # when it comes back, by the caller: so a few pass
-                if not is_recognised or count > SUSPICIOUS:
+                may_pass = subject.runs or not is_one_shot  # the caller recognises such messages when they come back
+                if not may_pass or count > SUSPICIOUS:
                     return Finding.CIRCULATES
-            period = _PERIOD_IN_STORM_S if count > STORM and not way.closed else PROBE_PERIOD_S
+            period = _PERIOD_IN_STORM_S if count > STORM and not way.closed else PROBE_PERIOD_S  # closed: known
             never_probed = way.probed_at == float("-inf")
             # Where any topic circulates, all others may as well.
             is_suspicious = way.closed or count > usual or (never_probed and bool(self.closed_ways))

@@ -212,7 +212,7 @@ class Forwarder:
         subject, by = sender.subject, sender.account  # sign() may add to this the person for whom the account acts
         outcome = self.admit(source, subject, message, sender.topic, by != NO_ACCOUNT)
         if subject is None:
-            outcome = sender.foreign  # the reason
+            outcome = sender.foreign  # why the topic means nothing to this robot
         elif isinstance(outcome, Forward):
             match names.sign(sender, message):
                 case Signed(signed, by) if by != NO_ACCOUNT and subject.kind is Kind.FLAG:
@@ -351,7 +351,7 @@ class Forwarder:
             payloads = list(self._pass_stop(source.side, message.payload))
             for payload in payloads:
                 self.publisher.publish(target, subject, Message(message.topic, payload, message.qos), forward)
-            return forward if payloads else Drop.RESET  # or, in the mirror, it is for one motor owner
+            return forward if payloads else Drop.RESET  # reset since; in the mirror: meant for one motor owner
         if is_event:
             self.publisher.note_return(target, subject, message)
             target.events.send(message)

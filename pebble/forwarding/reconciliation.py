@@ -96,11 +96,11 @@ class Reconciliation:
         self._winner = winner
         self._last = BoundedTable[LastValue](TOPICS, BYTES, lambda last: len(last.payload))
         self._held = BoundedTable[bytes](TOPICS, BYTES, len)  # the loser's values, until the winner's have arrived
-        self._published = {side: BoundedTable[bytes](TOPICS, BYTES, len) for side in Side}
+        self._published = {side: BoundedTable[bytes](TOPICS, BYTES, len) for side in Side}  # forwarded to each
         self._received: dict[Side, set[str]] = {side: set() for side in Side}  # since the connection began
         # Of topics on which the winner has published nothing since its connection began, as far as has arrived:
         self._offered: set[str] = set()  # the winner seemed to lack them, and was sent the loser's values
-        self._newer: set[str] = set()  # the loser has changed them since the winner's values should have been here
+        self._newer: set[str] = set()  # the loser has changed them after the winner's retained messages counted as here
         self._synchronized = dict.fromkeys(Side, False)
         self._overtaken: set[str] = set()  # changed by the loser while the winner was away
 

@@ -103,7 +103,7 @@ def _motor(
         touch_topic=addresses[c.TOUCH_SENSORS].topic,
         charging_topic=addresses[c.CHARGING_STATUS].topic,
         charging_level_topic=addresses[c.CHARGING_LEVEL].topic,
-        wheel_odometry=False,
+        wheel_odometry=False,  # unless an extension offers it
         wheel_odometry_topic=addresses[c.WHEEL_ODOMETRY].topic,
         imu=imu,
         imu_topic=imu_topic,

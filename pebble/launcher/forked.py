@@ -54,8 +54,8 @@ def become(
 def _arrange_descriptors(stdin: int, output: int, notes: int) -> None:
     """Set the child's standard descriptors and notes, and close all others, such as the launcher's lock."""
     wanted = (stdin, output, output, notes)
-    clear = [fcntl.fcntl(descriptor, fcntl.F_DUPFD_CLOEXEC, len(wanted)) for descriptor in wanted]
-    for number, descriptor in enumerate(clear):
+    out_of_the_way = [fcntl.fcntl(descriptor, fcntl.F_DUPFD_CLOEXEC, len(wanted)) for descriptor in wanted]
+    for number, descriptor in enumerate(out_of_the_way):  # else dup2 might close one that is still wanted
         os.dup2(descriptor, number, inheritable=number != _NOTES)  # what a child starts in turn must not write to it
     for name in os.listdir("/proc/self/fd"):  # noqa: PTH208  (a Path for each is slower than the fork itself)
         if int(name) > _NOTES:
@@ -93,7 +93,7 @@ def _run(program: Program) -> None:
     if ":" in program.module:
         sys.exit(run(part(program.module)))
     if not hasattr(sys.modules.get(program.module), "__path__"):
-        sys.modules.pop(program.module, None)  # it is __main__ now; importing it as well gives a second copy, as always
+        sys.modules.pop(program.module, None)  # imported before the fork; python -m has it as __main__ only
     runpy.run_module(program.module, run_name="__main__", alter_sys=True)
 
 

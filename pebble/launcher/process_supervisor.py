@@ -70,7 +70,7 @@ class ProcessSupervisor:
         self._is_stopping = is_stopping
         self._child: Child | None = None
         self._pipes: Pipes | None = None  # of the newest child
-        self._timer: Timer | None = None
+        self._timer: Timer | None = None  # for what, depends on the state: see ProgramState
         self._nonsense_logged = False
 
     @property

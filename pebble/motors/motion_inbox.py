@@ -72,7 +72,7 @@ class MotionInbox:
         self._resets: list[ReceivedReset] = []
         self._requests: dict[tuple[str, str], ReceivedRequest] = {}  # by sender, the newest sender last
         self._turns: dict[str, p.ControlTurn] = {}  # by owner
-        self._lost = False
+        self._lost = False  # messages, since the last batch
         self._vouched: p.ControlVouched | None = None
         self._drives: dict[int, list[ReceivedDrive]] = {}  # by sender, the newest sender last
 
@@ -100,7 +100,7 @@ class MotionInbox:
             sender = self._control.sender(request)
             waiting = self._requests.pop(sender, None)
             if len(self._requests) >= _REQUESTS:
-                knows = self._control.knows  # who neither has control nor asks first gives way
+                knows = self._control.knows  # a client without control gives way, but not the first that asks
                 del self._requests[next(key for key, received in self._requests.items() if not knows(received.request))]
                 self.dropped += 1
             waiting_takes_over = waiting is not None and waiting.over  # a renewal must not undo that

@@ -54,7 +54,7 @@ class MotorGuard:
     ) -> None:
         self._file, self._barred_file, self._counters, self._control = file, barred_file, counters, control
         self._state = Paced(lambda: publish(self.state()))
-        self._latch = Latch(control.boot, NAMES, operator.sub)
+        self._latch = Latch(control.boot, NAMES, operator.sub)  # this clock does not wrap, as an MCU's does
         self._arbiter = Arbiter(self._latch, control.lease, ms(now), operator.sub, round(1000 * watchdog_s))
         self._saving = self._saved = 0  # numbers of writes: the newest one, and the newest one that succeeded
         self._hold_until: float | None = None  # the end of the hold of the person who commanded last

@@ -78,7 +78,7 @@ def remote_transport(config: Config, name: str, *, will: Message | None = None) 
         program = "" if name == _BRIDGE else name
         settings = mqtt_settings(remote, as_published=True, reconnect_max_s=REMOTE_RECONNECT_S, program=program)
         settings = replace_settings(settings, vital=(*_VITAL_STATES, *_renamed_vital(config)))
-        if bridge.link.profile != "wide":
+        if bridge.link.profile != "wide":  # routers may send the bridge's packets before media
             settings = replace_settings(settings, dscp=_EXPEDITED if name == _BRIDGE else _ASSURED)
         return create("mqtt", _name(config, "mqtt", name), settings, will=will)
     kind = bridge.remote.kind

@@ -121,7 +121,7 @@ class LevelControl:
         self._slow_since = _since(self._slow_since, age_s > _SLOW_S, now)
         if age_s < _EMPTY_S:
             self._empty_at = now
-        is_fast = age_s < _FAST_S or now - self._empty_at < _BEACON_S  # waiting for a beacon is not slow
+        is_fast = age_s < _FAST_S or now - self._empty_at < _BEACON_S  # a Wi-Fi beacon may delay answers
         self._fast_since = _since(self._fast_since, is_fast, now)
         if now - self._changed_at < _PAUSE_S:
             return False

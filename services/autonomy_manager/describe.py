@@ -148,7 +148,7 @@ def _content(file: IO[bytes]) -> bytes:
 
 
 def _parse(raw: bytes, source: str) -> Description:
-    """Return the description in the last line of a script's output: imported modules may print lines before it."""
+    """Return the description in a manifest, or in the last line of an output: modules may print lines before it."""
     if len(raw) > _LONGEST:
         raise DescribeError(f"{source} is longer than {_LONGEST} bytes")
     try:

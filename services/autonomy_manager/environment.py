@@ -17,7 +17,7 @@ def environment(*more: Mapping[str, str], ours: bool = True) -> dict[str, str]:
     For foreign scripts (``ours`` False) ``python3`` is the system's, even if Pebble's comes first in PATH.
     """
     merged = {"PYTHONUNBUFFERED": "1", **child_environment()}  # else what it prints comes in blocks, long after
-    for name in (RUN, CONFIG):
+    for name in (RUN, CONFIG):  # which run and which robot: only ``more`` says that
         merged.pop(name, None)
     if not ours and sys.prefix != sys.base_prefix and SYSTEM.is_file():
         pebbles = str(Path(sys.prefix, "bin"))

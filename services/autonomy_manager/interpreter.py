@@ -94,7 +94,7 @@ def _needs(tree: ast.Module, text: bytes) -> Iterator[str]:
     """Yield what the script uses of OpenCV and NumPy that some releases or builds of them lack."""
     if b"shmsrc" in text:
         yield _GSTREAMER
-    if re.search(rb"\bfloat\((?!\s*[\"'\d])|\bmap\(float\b", text):  # perhaps of an array
+    if re.search(rb"\bfloat\((?!\s*[\"'\d])|\bmap\(float\b", text):  # perhaps of an array, which NumPy 2.4 refuses
         yield _OLD_NUMPY
     if re.search(rb"\bhasattr\(|\bAttributeError\b", text):
         return  # the script itself finds out which names there are

@@ -90,7 +90,7 @@ class AvDaemon(Service):
 
     @every(1.0)
     def publish_status(self) -> None:
-        """Publish the status: other words within a second, other numbers within a few seconds."""
+        """Publish the status: changed words within a second, changed numbers within a few seconds."""
         now = self.clock()
         streams = {stream.name: stream.report(now) for stream in self._streams}
         self._publish(self._reports.current(now) | streams)

@@ -96,7 +96,7 @@ class ComputedCamera(ComputedDevice, ABC):
 
 
 class SyntheticCamera(ComputedCamera):
-    """A camera that shows the scene: frame ``n`` at ``start + n / fps``."""
+    """A camera that shows a computed scene: frame ``n`` at ``start + n / fps``."""
 
     def __init__(self, video: CameraCapture, start: float) -> None:
         super().__init__(video, start)

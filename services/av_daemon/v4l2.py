@@ -61,7 +61,7 @@ class V4l2Camera:
             raise DeviceError(f"cannot open {self._name}: not there, in use, or no camera")
         if video.capture_format != "auto":
             fourcc = _FOURCC.get(video.capture_format, video.capture_format.upper())
-            capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*f"{fourcc:4.4}"))
+            capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*f"{fourcc:4.4}"))  # it takes four characters
         capture.set(cv2.CAP_PROP_FRAME_WIDTH, video.width)
         capture.set(cv2.CAP_PROP_FRAME_HEIGHT, video.height)
         capture.set(cv2.CAP_PROP_FPS, video.fps)

@@ -96,6 +96,7 @@ class RateController:
         self._window.clear()
 
     def _update(self, now: float) -> float:
+        """Note what was acknowledged, and adapt to it; return the connection's round trip in seconds."""
         outgoing = self._outgoing()
         acknowledged = self._window.poll(outgoing.waiting, outgoing.round_trip_s, now)
         for frame in acknowledged:
@@ -117,7 +118,7 @@ class Step:
 
     @property
     def cost(self) -> float:
-        """Share of the full bytes per second. With fewer frames, each differs more from the last."""
+        """Share of the full bytes per second. Fewer frames save a little less: each differs more from the last."""
         return self.bytes * math.pow(self.rate, 0.9)
 
     def __str__(self) -> str:
@@ -208,7 +209,9 @@ class LevelControl:
         frames = len(self._seen)
         busy = sum(took for _, took in self._seen) / frames / self._frame_s
         lost_share = sum(turns for _, turns in self._lost) / frames
-        return max(busy, 1.0 + lost_share) if lost_share > _LOST else busy
+        if lost_share <= _LOST:
+            return busy
+        return max(busy, 1.0 + lost_share)  # all its time was used, and the lost turns would have needed more
 
     def _go_down(self, load: float, now: float) -> bool:
         """Reduce as far as necessary. A step up that was just tried is undone, and tried later next time."""

@@ -38,9 +38,10 @@ class SendWindow:
     def __init__(self) -> None:
         self._frames = InFlight(_SLACK_BYTES)
         self._limit = 1  # frames that may be in flight
-        self._free_at = 0.0  # when the newest acknowledged one was
+        self._free_at = 0.0  # when the newest acknowledgement came: no earlier frame kept the connection busy any more
         self._round_trip_s, self._polled_at = 0.0, float("-inf")  # at the last poll
-        self._beacon_until = self._probed_at = float("-inf")
+        self._beacon_until = float("-inf")  # until then an access point is assumed to delay acknowledgements
+        self._probed_at = float("-inf")  # when a frame was last let through beside a late one, to observe that
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -66,7 +67,7 @@ class SendWindow:
         frames, slack_s = self._frames.acknowledge(waiting), self._slack_s(now)
         acknowledged = []
         for frame in frames:
-            began = max(frame.at + round_trip_s, self._free_at)  # what it took before was the path, or another frame
+            began = max(frame.at + round_trip_s, self._free_at)  # before, it was on its way or behind another frame
             self._free_at = now
             is_prompt = now - frame.at - round_trip_s <= _PROMPT_S
             self._limit = max(1, min(_MOST, self._limit + (1 if is_prompt else -1)))

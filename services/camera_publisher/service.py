@@ -152,8 +152,8 @@ class CameraPublisher(Service):
         picture = self._shape.picture(frame, self._rate.step.size)
         payload = self._encode(picture, frame.info.captured_ms)
         now = self.clock()
-        content = _BLACK if is_black(picture) else now  # only black ones count as the same
-        self._blackness.take(content, now)
+        # Only black pictures are noted as equal; any other one is noted as the time, which never repeats.
+        self._blackness.take(_BLACK if is_black(picture) else now, now)
         if not frame.valid():
             self._throw_away("overwritten")  # by the next frame, while it was encoded
         elif not self._remote.publish(self._picture_topic, payload, qos=QoS.LATEST):

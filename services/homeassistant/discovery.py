@@ -72,10 +72,12 @@ def discovery(base: str, capabilities: dict[str, Any], expose: Collection[str] =
 def _components(
     base: str, capabilities: dict[str, Any], expose: Collection[str], unit: str
 ) -> Iterator[tuple[str, Component]]:
+    """Yield the components by their keys, for what the capabilities offer and Home Assistant can show."""
+
     def topic(channel: c.Channel) -> str:
         return topic_of(base, capabilities, channel)
 
-    named = capabilities.get("named") is True
+    named = capabilities.get("named") is True  # the topic of a command needs the name of its sender
 
     def command(where: str) -> Component:
         return {"cmd_t": with_name(where, ACCOUNT) if named else where, "qos": 1}
@@ -101,7 +103,7 @@ def _components(
     for key, (section, channel) in _BUTTONS.items():
         offer = section_of(capabilities, f"system.{section}")
         if key in expose and offer.get("controls") is True:
-            listed = offer.get("flag_topic")
+            listed = offer.get("flag_topic")  # used only if it is the robot's, and no other channel's
             where = str(listed) if names(base, listed, channel) else channel.topic(base)
             button = {"p": "button", "name": key.capitalize(), "dev_cla": "restart", "pl_prs": "true"}
             yield key, button | command(where)

@@ -21,7 +21,7 @@ class MotorOwners:
         # By topic:
         self._messages = dict.fromkeys(self.topics, 0)  # how many of this connection arrived,
         self._checked = dict(self._messages)  # and how many until the last check
-        self._received_at: dict[str, float | None] = dict.fromkeys(self.topics)  # None: before the first check
+        self._waits_since: dict[str, float | None] = dict.fromkeys(self.topics)  # newest message, or the first check
         self._reported: dict[str, bool | None] = dict.fromkeys(self.topics)
 
     def connected(self) -> None:
@@ -36,10 +36,10 @@ class MotorOwners:
         for topic, owner in self.topics.items():
             count, count_before = self._messages[topic], self._checked[topic]
             self._checked[topic] = count
-            received_at, is_live = self._received_at[topic], count > 1
-            if received_at is None or (is_live and count != count_before):
-                received_at = self._received_at[topic] = now
-            reached = now - received_at < _MISSED_S
+            waits_since, is_live = self._waits_since[topic], count > 1
+            if waits_since is None or (is_live and count != count_before):  # at the first check the time limit begins
+                waits_since = self._waits_since[topic] = now
+            reached = now - waits_since < _MISSED_S
             if reached and not is_live:
                 continue  # a live message may still come in time
             if reached != self._reported[topic] and self._notifier.reaches(owner, reached):

@@ -59,7 +59,7 @@ class Owner:
         self.withdrawn_at: float | None = None  # since when it publishes that it has no emergency stop
 
     def confirms(self, name: str) -> bool:
-        """True if the owner's newest state names this stop and would survive a restart, or shows a reset."""
+        """True if the owner's newest state names this stop, unless the owner is latched and could not save that."""
         state = self.state
         return state is not None and name in state.recent and (state.persisted is not False or not state.latched)
 
@@ -98,7 +98,7 @@ class PassedStops:
     def accept(self, payload: bytes) -> list[bytes]:
         """Remember a named stop as forwarded, and let owners confirm it; return the payloads to publish.
 
-        An owner that was reset since the stop was first forwarded gets no copy of it.
+        An owner that was reset since the stop was first forwarded gets no copy, unless it has yet to confirm the stop.
         """
         if not is_stop(payload):
             return [payload]
@@ -108,7 +108,7 @@ class PassedStops:
             first = self._passed.setdefault(name, now)
             if len(self._passed) > NAMES:
                 del self._passed[next(iter(self._passed))]
-            waiting = {key for key, owner in self._owners.items() if _waits(owner, name)}  # have not confirmed it yet
+            waiting = {key for key, owner in self._owners.items() if _waits(owner, name)}  # may not have it yet
             reset_since = {key for key, owner in self._owners.items() if owner.freed_at > first} - waiting
             if reset_since:  # the stop is a repetition: for the others it was noted as pending when it came first
                 return [_addressed(stop, key) for key in self._owners if key not in reset_since]

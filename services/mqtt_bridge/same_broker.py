@@ -83,8 +83,8 @@ class SameBrokerProbe:
         self._round += 1
         if not self.send():
             return None
-        barrier(self._remote, remote_topic)  # until the remote side has the probe (whose topic it may forbid),
-        barrier(self._local, self.topic)  # then until the local side has received what that sent
+        barrier(self._remote, remote_topic)  # until the broker has the probe, whose own topic we may not subscribe to,
+        barrier(self._local, self.topic)  # then until the local side has received what had come by then
         return self._round if self.both_connected else None
 
     def proves_two_brokers(self, round_: int) -> bool:

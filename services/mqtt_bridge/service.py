@@ -79,7 +79,7 @@ class MqttBridge(ForwardingService):
         deciding_owner = min(self.config.motor_owners, default="")  # of several, the first by name gives control
         self._control_topic = c.CONTROL_STATE.topic(self.config.base, owner=deciding_owner) if deciding_owner else ""
 
-        # Private topics, which never leave the robot: none without an extension. The forwarder refuses them in groups.
+        # Private topics, which never leave the robot: none without an extension. No group of commands may have one.
         private = next((extension.private for extension in self.config.installed if extension.private), "")
         self._private = (part(private) if private else PrivateTopics)(self.config.base)
         self.forwarder.stays = self._private.stays
@@ -110,7 +110,7 @@ class MqttBridge(ForwardingService):
 
     @property
     def winner(self) -> Side:
-        """Side whose retained messages count: where names are checked the local one, as flags are the robot's own."""
+        """Side whose retained messages count: where names are checked the local one; only the robot retains there."""
         return Side.LOCAL if self.config.security.named else Side.REMOTE
 
     @property
@@ -149,7 +149,7 @@ class MqttBridge(ForwardingService):
         make = partial(StopConnection, transport, filters, self._pass_stop, self._forwards, self.clock)
         if not self._is_thin:
             return make(notices_s=self._silence_s + _NOTICED_S)
-        transport.suit_link(thin=True)
+        transport.suit_link(thin=True)  # there this connection is worth its cost only while a client floods the link
         notices_s = max(self._silence_s, LEVELS["thin"].silent_s) + _NOTICED_S
         return make(notices_s=notices_s, grace_s=_THIN_GRACE_S, wanted=lambda: self._uplink.is_flooded)
 
@@ -229,7 +229,7 @@ class MqttBridge(ForwardingService):
         if self.forwarder.gate is not Gate.OPEN:
             self._check_brokers()
             return
-        self._same_broker.send()
+        self._same_broker.send()  # the new connection may lead to another broker
         if side is Side.REMOTE and epoch == self.epoch:
             self.subscribe_remote()
 
@@ -259,9 +259,9 @@ class MqttBridge(ForwardingService):
             self._open()
         if self.forwarder.gate is Gate.OPEN or not self._same_broker.both_connected:
             return
-        round_ = self._same_broker.begin_round(self.subjects.topics(c.DRIVE)[0])
+        round_ = self._same_broker.begin_round(self.subjects.topics(c.DRIVE)[0])  # which a broker has to allow
         if round_ is not None:
-            wait_s = _PROBE_WAIT_S if self.forwarder.gate is Gate.WAITING else _AGAIN_WAIT_S
+            wait_s = _PROBE_WAIT_S if self.forwarder.gate is Gate.WAITING else _AGAIN_WAIT_S  # SHUT: a probe came back
             self.call_at(self.clock() + wait_s, partial(self._end_round, round_))
 
     def _end_round(self, round_: int) -> None:
@@ -419,7 +419,7 @@ class MqttBridge(ForwardingService):
             return
         if channel is None or codec.is_blank(message.payload):
             return
-        if not message.retain and routed.outcome is not Drop.KNOWN:
+        if not message.retain and routed.outcome is not Drop.KNOWN:  # else it brings nothing new
             # With a closed gate both sides may be one broker, and the message an operator's.
             by_robot = is_local and self.forwarder.gate is Gate.OPEN
             self._observers.passed(channel, ROBOT if by_robot else routed.by, message.payload)

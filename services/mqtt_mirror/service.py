@@ -50,11 +50,11 @@ class MqttMirror(ForwardingService):
         self._watched = frozenset({self._probe_topic} if bridge.enabled else ())
         if bridge.enabled and bridge.heartbeat.enabled:
             self._watched |= {self.addresses[ONLINE].topic}
-        self._fresh_s = _FRESH * silent_after(bridge.heartbeat.interval_seconds, bridge.link.slowest)
+        self._heartbeat_fresh_s = _FRESH * silent_after(bridge.heartbeat.interval_seconds, bridge.link.slowest)
         self._probes = Probes()
         self._announced = False  # the bridge has announced a probe since the newest check began
         self._under_way = False  # a probe of the bridge may be under way
-        # So long a probe is under way at most; 0.0: not known, for a remote side other than `remote_mqtt`.
+        # The longest time for which a probe is under way; 0.0: not known, for a remote side other than `remote_mqtt`.
         self._slowest_s = bridge.remote_mqtt.silence_seconds if bridge.remote is None else 0.0
         self._requested_at = float("-inf")
         self._is_operators = False  # by the newest check the broker is the operators', not one of the robot's
@@ -186,4 +186,4 @@ class MqttMirror(ForwardingService):
             heartbeat = codec.decode(ONLINE, message.payload)
         except PayloadError:
             return False
-        return heartbeat.online is not False and abs(time.time() - heartbeat.t / 1000) < self._fresh_s
+        return heartbeat.online is not False and abs(time.time() - heartbeat.t / 1000) < self._heartbeat_fresh_s

@@ -47,7 +47,7 @@ class NeighboursService(Service):
         super().__init__(*arguments, **options)
         self._section = self.config.section(NeighboursSection)
         self._me = me = self.config.identity
-        #: With the names of topics that are configured for the serial line of the motors.
+        #: As the process of the first motor board uses them: the config of its serial line may rename topics.
         self.addresses = Addresses(view_of(self.config, next(iter(self.config.motor_lines()), "")))
         self._lan = lan or _lan_transport(self.config)
         self._others = {name: Identity(me.system, me.type, name) for name in self._section.listens}

@@ -103,7 +103,7 @@ class Visit:
                 self._refused[name] = NeighbourRefusal(run=run, why=why or LOCAL)
             return False
         self.end(SUPERSEDED, now)
-        self._refused = self.refused(now)  # now with the reason why the run before this one has ended
+        self._refused = self.refused(now)  # this adds why the run before this one has ended
         self._refused.pop(name, None)
         self._who, self._sender = (name, run), DriveSender(number, self._publish)
         return True

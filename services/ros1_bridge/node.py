@@ -66,11 +66,12 @@ class Node:
         self._evicted = False
         self._publications: dict[str, Publication] = {}
         self._subscriptions: dict[str, Subscription] = {}
-        #: By topic and node: since when a subscriber that the master lists is not connected, or was last told.
+        #: Lost subscribers by topic and node: the master lists them, but they are not connected. Since when, or when
+        #: they were last told again that this node publishes the topic.
         self._missing: dict[tuple[str, str], float] = {}
-        self._lost: dict[tuple[str, str], list[str]] = {}  # such subscribers to tell now, with the publishers to name
+        self._lost: dict[tuple[str, str], list[str]] = {}  # those to tell now, and the topic's publishers
         self._is_lost = threading.Event()
-        self._revived = 0  # how often one was told
+        self._revived = 0  # how often a lost subscriber was told
         self._ends = threading.Event()
         self._threads: list[threading.Thread] = []
         self._calls: queue.Queue[Callable[[], None]] = queue.Queue(_MOST_CALLS_WAITING)

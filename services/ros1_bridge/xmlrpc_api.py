@@ -76,6 +76,10 @@ class ApiServer(ThreadingMixIn, SimpleXMLRPCServer):
         self._began: dict[Any, float] = {}  # the sockets of calls, the oldest first
 
     def process_request(self, request: Any, client_address: Any) -> None:
+        """Answer a call on a thread of its own. If there are too many, refuse it, and end the oldest if that one hangs.
+
+        The next call then finds room: callers that hang do not keep others out.
+        """
         now = time.monotonic()
         with self._lock:
             refused = len(self._began) >= _MOST_CALLS

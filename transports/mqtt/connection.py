@@ -217,7 +217,7 @@ class Connection:
             ready = self._poll.wait(max(wait_s, 0.0), write=blocked)
             now = clock.since_boot()
             if now - began <= wait_s + OVERSLEPT_S:
-                waiting.empty(now)  # what is there has come just now: this process did not sleep
+                waiting.empty(now)  # it was empty until now: the process did not sleep, so any bytes have just come
         readable, writable, _woken = ready
         if writable:
             self.incoming.answered_at = now  # the other side's TCP accepted some bytes: slow, but alive

@@ -170,8 +170,8 @@ class Dialler:
         """True if the broker's process seems to have ended. ``was_ended``: the result after the loss before this one.
 
         1. A connection was lost (``connected``): True, unless the broker was only silent. It may be we who stood still.
-        2. An attempt to connect has failed: ``was_ended`` still while nothing listens there, and until `_ENDING_S`
-           after that or after the loss. Later, or if the broker was silent: False.
+        2. An attempt to connect has failed: ``was_ended`` if nothing listens there. For `_ENDING_S` after that, or the
+           loss, a broker that ends may still hang up: ``was_ended``, too, unless it was silent. Otherwise False.
         """
         now, was_silent = time.monotonic(), isinstance(lost, Silent)
         if connected:

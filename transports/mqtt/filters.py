@@ -89,7 +89,7 @@ class BrokerFilters:
 class OwnMessageFilter:
     """A filter that recognises own retained messages that come back, and retained messages that come twice.
 
-    For as-published connections, where retained and live messages look alike (T7). Check messages with ``retain``.
+    For as-published connections, where retained and live messages look alike (T7). Only for messages with ``retain``.
     """
 
     def __init__(self) -> None:

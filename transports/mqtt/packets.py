@@ -250,7 +250,7 @@ class Reader:
                 else:
                     self._data, self._at = b"", 0
                 break
-            size, start = data[at + 1], at + 2  # the packet's length, usually of one or two bytes, and its end
+            size, start = data[at + 1], at + 2  # how many bytes follow the length, which has one to four, and where
             if size > 127 and start < end and (more := data[start]) < 128:
                 size, start = size & 127 | more << 7, start + 1
             elif size > 127:

@@ -95,7 +95,7 @@ class BrokerDelay:
             self._read = ping.sent_at, took_s
             self._newest = took_s if ping.clear else 0.0
             self.usual(took_s)
-        is_near = self._shortest <= _NEAR_S  # further off, every answer comes soon after some newer ping
+        is_near = self._shortest <= _NEAR_S  # else the answer to an older ping, too, may come soon after the newest one
         if is_near and self._pings and now - self._pings[-1].sent_at <= self._shortest + _NEAR_S:
             self._prompt += 1
         else:

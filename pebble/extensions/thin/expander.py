@@ -127,7 +127,7 @@ class Expander:
             if isinstance(wire.dict_id, int) and isinstance(wire.dict, str):
                 others = [entry for entry in robot.dictionaries.items() if entry[0] != wire.dict_id]
                 newest = (wire.dict_id, wire.dict.encode())
-                # A new object: _expand reads the old one without the lock.
+                # One older stays for groups under way. A new object: _expand reads the present one without the lock.
                 robot.dictionaries = dict([*others[-1:], newest])
 
     def _receive_short(self, message: Message) -> None:

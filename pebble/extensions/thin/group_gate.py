@@ -134,7 +134,7 @@ class GroupGate:
         subject = self._subjects[topic]
         assert subject is not None  # noqa: S101 - its metric is that of a channel
         message = replace(message, topic=topic, payload=member.payload)
-        way = self._forwarder.admit(source, subject, message, topic, named=True)  # chooses a limit: members have none
+        way = self._forwarder.admit(source, subject, message, topic, named=True)  # counted as messages with a name are
         if self._forwarder.stays(topic):
             way = Drop.STAYS
         if isinstance(way, Forward):

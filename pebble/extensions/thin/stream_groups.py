@@ -49,16 +49,18 @@ class StreamGroups:
         self._below = f"{addresses.base}/{OUTGOING}/"
         self._topic, self._wire = addresses[STREAMS].topic, addresses[WIRE].topic
         self._short = f"{SHORT}{link.short}" if link.short else ""
-        self._short_is_heard, self._tries = False, 0  # by an expander; to be heard there
+        self._short_is_heard = False  # by an expander
+        self._tries = 0  # empty groups sent to the short topic, so that an expander hears it
         self._remote, self._counters, self._clock = remote, counters, clock
         self._hz, self._named = link.group_hz, config.security.named
         self._contract_only = config.security.level != "open"  # brokers let an expander publish no others
         self._lock = threading.Lock()  # guards the messages that wait
         self._waiting: dict[str, bytes] = {}  # by metric
-        self._heard_at = self._sent_at = self._learned_at = -inf  # an expander; a group; the dictionary
+        self._heard_at = self._sent_at = -inf  # when an expander was heard, and when a group was sent
+        self._learned_at = -inf  # when a group became the dictionary
         self._heard_since = inf  # since when an expander is heard
         self._dict_id, self._dictionary = now_ms() % LAST_DICT + 1, b""  # probably not the number before a restart
-        self._dictionary_metrics: frozenset[str] = frozenset()
+        self._dictionary_metrics: frozenset[str] = frozenset()  # of the streams in that group
         self._is_announced = False
 
     def heard(self, raw: bytes) -> None:

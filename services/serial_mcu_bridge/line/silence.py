@@ -33,12 +33,12 @@ class Silence:
         self._received = received
         if has_sent:
             self._received_at = now
-        if self._unasked < _REGULAR and now - self._counted_at >= 0.9 * CHECK_S:
+        if self._unasked < _REGULAR and now - self._counted_at >= 0.9 * CHECK_S:  # extra checks do not count
             self._counted_at = now
             self._unasked = self._unasked + 1 if has_sent and idle else 0
         if self._received_at is None or state is not LineState.READY:
             return state.value, None
         age_s = now - self._received_at
         if age_s >= _SILENT_S:
-            return "silent" if self._unasked >= _REGULAR else state.value, 10_000
-        return state.value, 0 if age_s < _RECENT_S else 1_000
+            return ("silent" if self._unasked >= _REGULAR else state.value), 10_000
+        return state.value, (0 if age_s < _RECENT_S else 1_000)

@@ -48,7 +48,7 @@ class HallMemory:
         self._number += 1
         place = _HEADER.size + (self._number - 1) % self._slots * _SLOT.size
         _SLOT.pack_into(memory, place, self._number, at_ns, *values, -1 if charging is None else int(charging))
-        words[_NEWEST] = self._number  # last, for a reader goes by it, and at once: struct would write a 0 before it
+        words[_NEWEST] = self._number  # last, as readers go by it, and as a whole word: struct would clear it first
 
     def close(self) -> None:
         if self._opened is not None:

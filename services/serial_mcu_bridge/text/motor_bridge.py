@@ -58,7 +58,7 @@ class MotorBridge(MotorOwner, SerialService):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self._publishes_touch = self.options.telemetry.publish_touch_sensors
-        self._power, self._again_at = (0.0, 0.0), 0.0  # of the left and the right wheel, as published; and when again
+        self._power, self._again_at = (0.0, 0.0), 0.0  # (left, right) as published last, and when it is due again
         self._charging: ChargingStatus | None = None
         memory = self.config.hall_memory(self.options)
         self._hall = None if memory is None else HallMemory(memory)

@@ -51,7 +51,7 @@ class HubWorker:
     def serve(self, session: zenoh.Session) -> None:
         """Serve the clients of ``session``, in place of the former session, which is closed."""
         if self._session is not None:
-            self.post(self._await_return)
+            self.post(self._await_return)  # of its clients, before their wills are published
         self._session = session
         # Not the hub's own messages: they would wait for room in the queue, which this thread empties.
         retain = direct(lambda sample: self._intake.receive(partial(self._store_retained, sample), len(sample.payload)))

@@ -55,7 +55,7 @@ class Outgoing(NamedTuple):
 
 
 class _Address(NamedTuple):
-    """The topic and the rule for a recorded channel's messages."""
+    """A recorded channel's robot, and the base, topic, channel and QoS with which its messages are published."""
 
     recorded: Identity
     base: str  # the new one
@@ -83,7 +83,7 @@ class Rules:
         return self._listed(channel) is not None
 
     def outgoing(self, recorded: Recorded, by_ns: int) -> Outgoing | None:
-        """Return the message to publish for a recorded one, with its stamps moved by ``by_ns``; None for none."""
+        """Return the message to publish for a recorded one, with its stamps moved by ``by_ns``; None: there is none."""
         address = self._listed(recorded.channel)
         if address is None or _is_probe(recorded.payload):
             return None

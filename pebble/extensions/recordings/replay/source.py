@@ -29,7 +29,7 @@ class ReplaySource:
             with RecordingFile(path) as file:
                 self.channels += file.channels.values()
                 self.missing += missing_before(file.metadata())
-                if not file.chunks:
+                if not file.chunks:  # nothing can be read of it; damage of other files shows while they are read
                     self.damages[path] = file.damage
         self._archive = Archive(*self._paths)
 

@@ -29,7 +29,7 @@ _time = attrgetter("log_ns")
 
 
 class _Named(NamedTuple):
-    """A file, and the facts in its name if a recorder made that."""
+    """A file, and the facts in its name if a recorder has named it."""
 
     path: Path
     lane: str  # "": any
@@ -90,7 +90,7 @@ class Archive:
         return sorted(newest_first, key=_time)
 
     def pictures(self, robot: str, at_ns: int) -> list[Recorded]:
-        """Return the last picture before ``at_ns`` after those that it builds on; empty if there is none."""
+        """Return the last picture before ``at_ns``, preceded by those that it builds on; empty if there is none."""
         chain: list[Recorded] = []
         size = 0
         for message in self._pictures_before(robot, at_ns):
@@ -216,7 +216,7 @@ def _within(file: RecordingFile, channels: frozenset[int], since_ns: int, until_
         for chunk in file.chunks
         if chunk.end_ns >= since_ns
         and chunk.start_ns < until_ns
-        and (not chunk.channels or not chunk.channels.isdisjoint(channels))
+        and (not chunk.channels or not chunk.channels.isdisjoint(channels))  # none: not known
     ]
 
 

@@ -84,7 +84,7 @@ def _days(file: RecordingFile) -> list[Day]:
 
 
 def _driven(file: RecordingFile, begin: int, end: int) -> dict[str, float]:
-    """Return the driven seconds within a day, by robot."""
+    """Return the driven seconds within a day, by robot; a chunk with a drive command counts in full."""
     robots: dict[int, str] = {}  # by the number of a channel with drive commands
     for number, channel in file.channels.items():
         robot = robot_of(channel.topic)

@@ -179,5 +179,5 @@ def _svg(draw: Any, robot: RobotTraffic, name: str) -> str:
     text = re.sub(r"<metadata>.*?</metadata>", "", text, count=1, flags=re.DOTALL)
     text = re.sub(r' xmlns(:\w+)?="[^"]*"', "", text)
     text = re.sub(r'<g id="[^"]*"', "<g", text)
-    text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
+    text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)  # the page sets both sizes
     return re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1)

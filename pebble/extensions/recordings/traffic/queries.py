@@ -151,7 +151,7 @@ class RobotQueries:
         """Create the tables of the messages in a period."""
         robot = f"SELECT * FROM {parquet(indexes)} WHERE robot = {quoted(self._robot)}"
         indexed = f"CREATE OR REPLACE TEMP VIEW indexed AS {robot}"
-        inside = ["NOT retained"]
+        inside = ["NOT retained"]  # a message that was retained is from an earlier time
         if since_ns:
             inside.append(f"ts >= make_timestamp_ns({since_ns})")
         if until_ns < FOREVER_NS:

@@ -144,7 +144,7 @@ def _is_answer(before: AutonomyStatus | None, now: AutonomyStatus | None, file: 
     if _runs(before, now, file):
         return True
     is_new_error = before is None or now.error != before.error
-    return bool(now.error) and (is_new_error or elapsed_s > _SAME_ERROR_S)
+    return bool(now.error) and (is_new_error or elapsed_s > _SAME_ERROR_S)  # an earlier error counts if it stays
 
 
 def _runs(before: AutonomyStatus | None, now: AutonomyStatus, file: str) -> bool:
@@ -178,7 +178,7 @@ def _print_status(status: AutonomyStatus) -> None:
 
 def _option(setting: forms.Setting) -> str:
     """Return an option's line, such as ``--tag-id INT  Tag ID (default: 13)``."""
-    names: dict[bool | None, str] = {}  # by the value of a flag, or None: the first name
+    names: dict[bool | None, str] = {}  # the first option for each value of a flag; None: for other settings
     for option, value in options_of(setting):
         names.setdefault(value, option)
     usage = f"{names.get(None)} {setting.type.upper()}"

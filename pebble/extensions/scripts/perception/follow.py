@@ -101,7 +101,7 @@ class Follower:
     def __init__(self, settings: FollowSettings) -> None:
         self.settings = settings
         self._pulses = Pulses()
-        self._seen_at = self._reversed_at = float("-inf")
+        self._seen_at = self._side_since = float("-inf")
         self._side = 1.0  # the side on which the tag was seen last, and to which the search turns: right is positive
         self._last = Command()
         self._holding = False  # the wanted distance is reached
@@ -112,7 +112,7 @@ class Follower:
         return self._last
 
     def _with_tag(self, now: float, place: Place) -> Command:
-        self._seen_at = self._reversed_at = now
+        self._seen_at = self._side_since = now
         self._near = place.distance_m < self.settings.target_distance_m + _NEAR_M
         self._side = math.copysign(1.0, place.angle_rad)
         if abs(place.angle_rad) > math.radians(self.settings.forward_cone_deg):
@@ -154,7 +154,7 @@ class Follower:
             return self._last  # it may be missing in a single picture
         self._holding = False
         if self._near and 0.0 < gone_s - settings.tag_timeout_s <= _AWAY_S:
-            return Command(0.0, -_AWAY_POWER, "back away")
+            return Command(0.0, -_AWAY_POWER, "back away")  # it was so near that it has outgrown the picture
         if gone_s <= settings.lost_timeout_s:
             return Command(reason="wait")
         return self._search(now)
@@ -162,9 +162,9 @@ class Follower:
     def _search(self, now: float) -> Command:
         settings = self.settings
         reverse_s = settings.search_reverse_after_s
-        if reverse_s > 0.0 and now - self._reversed_at > reverse_s:
+        if reverse_s > 0.0 and now - self._side_since > reverse_s:
             self._side = -self._side
-            self._reversed_at = now
+            self._side_since = now
         # A pulse lasts for one or two commands: with more power one could turn past all that the camera sees.
         x = self._pulses.turn(self._side * settings.turn_power, settings.turn_pulse_s, settings.search_pause_s, now)
         return Command(x, 0.0, "search")

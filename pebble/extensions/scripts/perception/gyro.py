@@ -18,12 +18,12 @@ class GyroHeading:
     """The turns measured by an inertial sensor that lies flat; + is counter-clockwise."""
 
     def __init__(self) -> None:
-        self._turn_rad = 0.0  # since it was taken
+        self._turn_rad = 0.0  # since the last call of :meth:`take`
         self._bias_dps = 0.0
-        self._at_rest = 0  # samples
-        self._mcu_ms: int | None = None
-        self._at = float("-inf")  # the newest sample
-        self._limited = False  # a turn since then was too fast for the sensor
+        self._samples_at_rest = 0
+        self._mcu_ms: int | None = None  # of the newest sample, by the board's clock
+        self._at = float("-inf")  # when it came
+        self._limited = False  # a turn since the last call of :meth:`take` was too fast for the sensor
         self._agreed_rad = self._compared_rad = 0.0  # turns by the sensor in the wheels' direction, and by the wheels
         self._trusted = True
 
@@ -32,8 +32,8 @@ class GyroHeading:
         gap_ms = 0 if self._mcu_ms is None else mcu_ms - self._mcu_ms
         self._mcu_ms, self._at = mcu_ms, now
         if at_rest:
-            self._at_rest += 1
-            self._bias_dps += max(_BIAS_WEIGHT, 1.0 / self._at_rest) * (z_dps - self._bias_dps)
+            self._samples_at_rest += 1
+            self._bias_dps += max(_BIAS_WEIGHT, 1.0 / self._samples_at_rest) * (z_dps - self._bias_dps)
         elif 0 < gap_ms <= _GAP_MS:
             self._turn_rad += math.radians(z_dps - self._bias_dps) * gap_ms / 1000
             self._limited = self._limited or abs(z_dps) >= _LIMIT_DPS

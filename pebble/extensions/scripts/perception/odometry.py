@@ -89,7 +89,7 @@ class WheelPose(NamedTuple):
 
 @dataclass(slots=True)
 class _Part:
-    """An arc of the way: the part of one sample, or the part whose distances may still be corrected."""
+    """An arc of the way: that of the newest sample, or of all samples whose distances may still be corrected."""
 
     ahead_mm: float = 0.0
     turn_rad: float = 0.0
@@ -214,7 +214,7 @@ class Odometry:
         self.pose = part.end(self._base)
         is_ready = self._left.hall.ready and self._right.hall.ready
         if is_ready:  # the part will not be corrected any more
-            if self.moving(now) or not self._was_ready:  # at rest it is noise; a warm-up's part may end at rest
+            if self.moving(now) or not self._was_ready:  # a distance at rest is noise, unless a warm-up ends now
                 self.distance_mm += abs(part.ahead_mm)
             self._base, self._part = self.pose, _Part()
         self._was_ready = is_ready
