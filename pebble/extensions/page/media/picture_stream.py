@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 from pebble.extensions.media.picture_header import PictureHeader, PictureSequence
 from pebble.extensions.operator.client.broker import Broker
 from pebble.extensions.operator.client.media_request.offer import BEST_FIRST, best, offered
-from pebble.extensions.operator.client.media_request.queue import NO_FRAME, Frame, ViewerQueue, assess
+from pebble.extensions.operator.client.media_request.queue import Frame, ViewerQueue, assess
 from pebble.extensions.page.media import rescue
 from pebble.extensions.page.media.rescue import RescuedPicture, RescueStream
 from pebble.extensions.page.media.stream import MediaStream
@@ -58,11 +58,11 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
         """Handle a page's answer to the frame ``seq``."""
         now = time.monotonic()
         frame = viewer.queue.acknowledge(seq, now)
-        if frame is not None or seq == NO_FRAME:  # else an answer to a frame that was answered before, or never sent
+        if frame is not None:  # else an answer to a frame that was answered before, or never sent
             if answer == _KEY_FRAME_WANTED:
                 viewer.queue.note_keyframe_request(now)
             elif answer == _CANNOT_DECODE:
-                viewer.queue.cannot_decode(self._arrivals.encoding if frame is None else frame.encoding)
+                viewer.queue.cannot_decode(frame.encoding)
         viewer.wakeup.set()
         if answer:
             self._request.wake()
@@ -123,7 +123,7 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
             viewer.wakeup.set()
 
     def _next_seq(self) -> int:
-        self._seq = (self._seq + 1) % NO_FRAME  # NO_FRAME itself is no number
+        self._seq = (self._seq + 1) % (1 << 32)
         return self._seq
 
     # -- requests, and key frames

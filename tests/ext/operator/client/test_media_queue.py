@@ -9,7 +9,6 @@ import pytest
 from pebble.extensions.operator.client.media_request.offer import Medium, best
 from pebble.extensions.operator.client.media_request.queue import (
     MAX_FRAMES,
-    NO_FRAME,
     THIN_ACK_S,
     Frame,
     ViewerQueue,
@@ -99,7 +98,6 @@ def test_an_unknown_acknowledgement_is_ignored() -> None:
     queue.offer(frame(0, keyframe=True))
     queue.take(0.0)
     assert queue.acknowledge(7, 9.0) is None
-    assert queue.acknowledge(NO_FRAME, 9.0) is None
     assert queue.acknowledge(0, 0.1) == frame(0, keyframe=True)
     assert queue.acknowledge(0, 9.0) is None
     assert queue.ack_s == 0.1

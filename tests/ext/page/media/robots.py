@@ -221,7 +221,9 @@ class Page:
 
 
 class PicturePage(Page):
-    """Looks, and draws everything."""
+    """Looks, and draws everything, or answers ``what``."""
+
+    what = 0
 
     @property
     def frames(self) -> list[tuple[int, int, bytes]]:
@@ -229,7 +231,7 @@ class PicturePage(Page):
         return [(*struct.unpack_from(">IB", data), data[5:]) for data in self.received]
 
     def take(self, data: bytes) -> None:
-        self.acknowledge(struct.unpack_from(">I", data)[0], 0)
+        self.acknowledge(struct.unpack_from(">I", data)[0], self.what)
 
     def acknowledge(self, seq: int, what: int) -> None:
         """Acknowledge a picture. ``what``: 0 it is drawn, 1 a key frame is wanted."""

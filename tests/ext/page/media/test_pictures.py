@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from pebble.extensions.media.decode import VideoDecoder
-from pebble.extensions.operator.client.media_request.queue import NO_FRAME
 from pebble.extensions.page.media import rescue
 from tests.ext.page.media.robots import EVERYTHING, REF, VIDEO, PicturePage, PictureRobot, Server, serving, until
 from tests.kit.scene import read_counter
@@ -110,7 +109,7 @@ async def test_a_page_that_wants_a_key_frame_gets_one(robot: PictureRobot, serve
     await until(lambda: len(page.frames) > 5)
     await asyncio.sleep(1.0)  # one is requested once a second
     count = len(page.frames)
-    page.acknowledge(NO_FRAME, 1)
+    page.what = 1
     await until(lambda: any(request.get("keyframe") for request in robot.requests))
     await until(lambda: len(page.frames) > count + 3)
 

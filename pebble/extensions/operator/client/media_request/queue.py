@@ -21,7 +21,6 @@ THIN_ACK_S, THIN_FRAMES = 0.4, 2
 MAX_FRAMES: Final = 4  # that wait for a viewer; the oldest goes
 SLOW_FRAMES: Final = 1  # JPEG encodings on a slow connection: the next key frame is near, and shows what is newer
 MAX_QUEUED_BYTES: Final = 4 << 20  # of these frames
-NO_FRAME: Final = 0xFFFF_FFFF  # the number in an acknowledgement of no frame
 
 _FRESH_FRAMES: Final = 2  # with no more than these in the queue, a key frame does not replace them
 _JPEG_PATIENCE_S: Final = 1.0  # JPEG encodings have a key frame each third of a second, unless configured otherwise
