@@ -75,7 +75,7 @@ class Robot:
         if letter == _DRIVE:
             self.deadman.feed(self._now)
             self._left.set(clamp(numbers[0], -1.0))
-            self._right.set(-clamp(numbers[1], -1.0))
+            self._right.set(-clamp(numbers[1], -1.0))  # mounted the other way round
             return
         blue, green, red = clamp(numbers[0], 0.0), clamp(numbers[1], 0.0), clamp(numbers[2], 0.0)
         if letter == _GLOW:
