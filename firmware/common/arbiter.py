@@ -60,7 +60,7 @@ class Arbiter:
             run = PERSON
         if lease.refuses(moves, run != PERSON or local, key, "" if local else by, now):
             return REFUSED
-        without_control = run == PERSON and lease.key != "" and not lease.holds(key, by)  # another has it
+        without_control = run == PERSON and lease.key and not lease.holds(key, by)  # another has it
         if newer(run, self.barred) and run != self._newest:  # it has begun, even if this command is refused
             self._newest = run
             self.bar(run - 1 or LAST_RUN)
