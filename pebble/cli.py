@@ -79,7 +79,7 @@ def _open_missing_streams() -> None:
         if getattr(sys, name) is None:
             descriptor = os.open(os.devnull, os.O_RDWR)  # the lowest free one: that of this stream
             os.set_inheritable(descriptor, True)
-            # As Python's own: it stays open when a child replaces the stream, and its descriptor by a pipe.
+            # closefd: a forked child puts a pipe at this number and drops the stream, which must not close the pipe.
             setattr(sys, name, os.fdopen(descriptor, mode, encoding="utf-8", closefd=False))
 
 

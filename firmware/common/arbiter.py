@@ -7,8 +7,8 @@ its run, which grows with each start; a run that is barred never moves anything 
 LAST_RUN comes 1, so whatever number a stranger sends, there is a newer one.
 """
 
-# So long after a person's last command scripts are refused; and after the start, so that their manager first sees that
-# their owner restarted.
+# So long after a person's last command scripts are refused; and after the start, so that the script manager first
+# sees that the motor owner has restarted.
 HOLD_MS = 2000
 
 LAST_RUN = (1 << 30) - 1  # the largest integer for which MicroPython allocates no memory on a 32-bit board
@@ -34,7 +34,7 @@ class Arbiter:
         self._diff = diff
         self._watchdog_ms = watchdog_ms
         self._newest = 0  # the newest run received; all before it are barred
-        self._starting = True  # for HOLD_MS scripts are refused
+        self._starting = True  # scripts are refused for HOLD_MS, see there
         self._started = now
         self._held = False  # by a person
         self._held_from = now
@@ -54,24 +54,24 @@ class Arbiter:
         self.tick(now)
         lease = self.lease
         local = by is None
-        if by and run != PERSON and not lease.holds(key, by):  # of a script elsewhere only a zero counts, as a person's
+        if by and run != PERSON and not lease.holds(key, by):  # a script elsewhere: its zero counts as a person's
             if moves:
                 return REFUSED
             run = PERSON
         if lease.refuses(moves, run != PERSON or local, key, "" if local else by, now):
             return REFUSED
-        ours = run != PERSON or not lease.key or lease.holds(key, by)  # if so, a zero may end the latch's wait
+        without_control = run == PERSON and lease.key and not lease.holds(key, by)  # another has it
         if newer(run, self.barred) and run != self._newest:  # it has begun, even if this command is refused
             self._newest = run
             self.bar(run - 1 or LAST_RUN)
         if self.latch.latched:
             self.bar(run)
         # after a reset the latch waits for a zero: not that of a client without control
-        if (moves or ours) and self.latch.refuses(moves, run != PERSON, now):
+        if (moves or not without_control) and self.latch.refuses(moves, run != PERSON, now):
             return REFUSED
         limit = self._watchdog_ms if valid_ms < 0 or valid_ms > self._watchdog_ms else int(valid_ms)
         if run == PERSON:
-            self._take(moves, valid_ms == 0 or not ours, now)
+            self._take(moves, valid_ms == 0 or without_control, now)
         # people first; and not before scripts may run, nor of a run that is barred
         elif self._held or self._starting or (run > 0 and not newer(run, self.barred)):
             return REFUSED

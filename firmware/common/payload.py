@@ -15,7 +15,7 @@ def load(raw: memoryview | bytes):
     """Return parsed JSON of limited size and depth. Raises ValueError, OverflowError or MemoryError.
 
     Around it may be what programs add: a byte order mark, white space, a C string's NUL and the rest of its buffer.
-    There all but printable ASCII and bytes unknown to UTF-8 (from 0xF5) is removed; JSON begins and ends with ASCII.
+    Both ends are cut up to printable ASCII, which JSON begins and ends with, or a byte that no UTF-8 has (from 0xF5).
     """
     size = len(raw)
     if size > _MAX_BYTES:
@@ -50,7 +50,7 @@ def parse(raw: memoryview | bytes, grouped: bool = False) -> tuple[float, float,
     """
     try:
         body = load(raw)
-        alone = True  # the group has no other member
+        alone = True  # no other member, nor this one twice: a parser keeps the last of equal keys
         if grouped and isinstance(body, dict):
             alone = len(body) == 1 and bytes(raw).count(b'"drive-values"') == 1
             body = body.get("drive-values")

@@ -90,7 +90,7 @@ class Robot:
                 lines.rest(now)
                 break
             lines.take(byte)
-            port.send()
+            port.send()  # now, too: the ring has no room for the answers to many short lines
         if self._fade_grid.due(now):
             self._shine(now)
         if self._sensors_grid.due(now):

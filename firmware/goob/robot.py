@@ -58,7 +58,7 @@ class Robot:
                 lines.rest(now)
                 break
             lines.take(byte)
-            port.send()
+            port.send()  # now, too: the ring has no room for the answers to many short lines
         if self._sensors_grid.due(now):
             a0, a1, a2 = self._sensors
             lines.put(b"T a0=%d a1=%d a2=%d" % (a0.read_u16() >> 6, a1.read_u16() >> 6, a2.read_u16() >> 6))
@@ -75,7 +75,7 @@ class Robot:
         if letter == _DRIVE:
             self.deadman.feed(self._now)
             self._left.set(clamp(numbers[0], -1.0))
-            self._right.set(-clamp(numbers[1], -1.0))
+            self._right.set(-clamp(numbers[1], -1.0))  # mounted the other way round
             return
         blue, green, red = clamp(numbers[0], 0.0), clamp(numbers[1], 0.0), clamp(numbers[2], 0.0)
         if letter == _GLOW:

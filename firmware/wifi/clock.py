@@ -24,7 +24,7 @@ class Clock:
         self.read = self._wall.read
         self._open: Query | None = None  # the DNS query for the server's name; with a nonce, the request to it
         self._nonce: bytes | None = None
-        self._due = now
+        self._due = now  # the next query, or since when the present one waits
 
     def step(self, now: int, server: str) -> None:
         """Continue a request. ``server`` is the DNS server; "": there is no network. Failures are retried later."""

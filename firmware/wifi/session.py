@@ -79,7 +79,7 @@ class Session:
     def _connect(self, now: int, clock) -> None:
         """Connect once the address is known."""
         assert self._open
-        address = self._open.address(now)  # type: ignore[attr-defined]  # it is a Question
+        address = self._open.address(now)  # type: ignore[attr-defined]  # a Query until here
         if address is None:
             return
         self._open.socket.close()

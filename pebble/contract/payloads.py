@@ -312,7 +312,7 @@ class ControlState(Payload, frozen=True, kw_only=True):
 class ControlTurn(Payload, frozen=True, kw_only=True, omit_defaults=True):
     """The grant of the first of several motor owners; of another owner only ``boot`` and ``turn``, which it follows."""
 
-    boot: str  # of the first owner
+    boot: str  # of the first owner; the others answer with the boot and turn that they follow
     turn: Annotated[int, Meta(ge=0)]  # grows whenever control passes on, also to nobody
     t: Annotated[int, Meta(ge=0, le=LARGEST_MS)] = 0  # when it was sent, by the machine's clock since its start
     key: str = ""

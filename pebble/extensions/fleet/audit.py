@@ -61,9 +61,9 @@ class Audit:
     ) -> None:
         fields = zip(_FIELDS, (ref, user, device, address, detail), strict=True)
         texts = {field: text[:_MAX_TEXT].encode(errors="replace").decode() for field, text in fields}
-        refused = what in REFUSED  # of these, one row stands for all of a network, whatever names they try
-        like = (what, network_of(address)) if refused else None
-        most = OF_STRANGERS if refused else DIFFERENT
+        refused = what in REFUSED
+        like = (what, network_of(address)) if refused else None  # one row for a network, whatever names it tries
+        most = OF_STRANGERS if refused else DIFFERENT  # different rows a minute, see RowWriter.add
         self._writer.add({"t": time.time(), "what": what, **texts}, like, most)
 
     def read(self, limit: int, ref: str = "") -> list[Entry]:

@@ -52,8 +52,8 @@ def conf_text(fleet: Fleet, folder: Path, user: str) -> str:
     where = f" {server.host}" if is_loopback(server.host) else ""
     tls = [f"cafile {folder / CA_CERT}", f"certfile {folder / SERVER_CERT}", f"keyfile {folder / SERVER_KEY}"]
     limit = f"max_connections {MAX_CONNECTIONS}"
-    by = "setup`" if server.included else f"fleet init`; run `mosquitto -c {folder / CONF}`"
-    lines = [f"# Written by `pebble {by}.", "per_listener_settings false"]
+    made_by = "`pebble setup`" if server.included else f"`pebble fleet init`; run `mosquitto -c {folder / CONF}`"
+    lines = [f"# Written by {made_by}.", "per_listener_settings false"]
     lines.append("allow_anonymous false")
     if not server.included:
         lines += [f"user {user}", f"pid_file {folder / PID}", "log_dest stderr"]

@@ -163,7 +163,7 @@ def locked(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise FleetError(f"{folder}: {error.strerror}") from None
     try:
-        import fcntl  # the command explains itself where there is none
+        import fcntl  # Windows has none: there only what changes a fleet fails
 
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX)

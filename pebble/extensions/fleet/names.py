@@ -123,7 +123,7 @@ def _is_zero(channel: Channel, payload: bytes) -> bool:
 
 
 def _is_group(payload: bytes) -> bool:
-    """True if the payload is a valid group: it is checked before decoding joins keys that occur twice."""
+    """True if the payload is a valid group. Decoding keeps the last of equal keys, so that is checked before."""
     try:
         return bool(groups.decode(payload))
     except PayloadError:

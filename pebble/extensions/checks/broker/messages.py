@@ -14,7 +14,7 @@ from pebble.transports import Message, QoS
 
 _APART_S = 0.005  # between the two messages of a pair
 _HELD_S = 0.03  # so much Nagle's algorithm delays a message at least, where the receiver's kernel confirms late
-_HELD = 0.75  # the same in round trips: a thin link itself needs some of one for the second message
+_HELD_ROUND_TRIPS = 0.75  # the same in round trips: a thin link itself needs some of one for the second message
 _PAIRS = 5
 _PING_TRIES = 3  # an answer that comes too early may by chance come last
 _PING_S = 2.0  # after which a robot gives a connection up
@@ -159,7 +159,7 @@ def held_back(trial: BrokerTrial, reader: Peer, writer: Peer, topic: str) -> Che
         round_trips_s.append(pair[0])
         gaps_s.append(pair[1])
     late_s = median(gaps_s) - _APART_S
-    if late_s < max(_HELD_S, _HELD * min(round_trips_s)):
+    if late_s < max(_HELD_S, _HELD_ROUND_TRIPS * min(round_trips_s)):
         return ok("are passed on at once")
     text = f"it holds them back: a message that follows another one comes {1000 * late_s:.0f} ms late"
     return warn(text, f"{MOSQUITTO}set_tcp_nodelay true")

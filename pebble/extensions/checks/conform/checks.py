@@ -150,7 +150,7 @@ def retained(robot: Observer) -> CheckResult:
             continue
         if channel.default_retain and channel not in _REPEATED and not is_retained:
             lacking.add(record.metric)
-        if is_retained and not channel.default_retain and channel is not c.MCU_VALUE:  # that its manifest decides
+        if is_retained and not channel.default_retain and channel is not c.MCU_VALUE:  # its manifest decides
             stale.add(record.metric)
     if lacking:
         fix = "publish it with the retain flag: who connects later lacks it"

@@ -31,6 +31,7 @@ from pebble.extensions.checks.observer import ANSWER_S, Observer
 
 RESTS_S = 0.75  # after the last command, at the latest
 LATE_S = 0.5  # until a report of it is here
+_ENDS_S = 0.25  # after a stop, or when another takes control
 _SWING = 30  # of a hall sensor's value: less is noise
 _HALF_TRACK_M = 0.25  # of wheels that are known by odometry: only their signs are judged
 _OTHER_KEY, _OTHER_ACCOUNT = "0badf00d", "conform-other"
@@ -214,7 +215,7 @@ def _stop_moving(robot: Observer, driver: Driver) -> CheckResult:
     driver.drive()
     driver.send()  # a zero, which ends the gesture
     driver.drive(DRIVES_S / 2)
-    outcome = _rest(robot, began, stopped_at, limit_s=0.25, what="the stop")
+    outcome = _rest(robot, began, stopped_at, limit_s=_ENDS_S, what="the stop")
     return outcome if freed(robot) else failed("a reset does not end the stop", END_IT)
 
 
@@ -272,7 +273,7 @@ def _control_passes(robot: Observer, driver: Driver) -> CheckResult:
     taken_at = second.takes()
     robot.answers(lambda: second.holds)
     driver.drive(key=key)
-    outcome = _rest(robot, began, taken_at, limit_s=0.25, what="another took control")
+    outcome = _rest(robot, began, taken_at, limit_s=_ENDS_S, what="another took control")
     second.leaves()
     return outcome
 

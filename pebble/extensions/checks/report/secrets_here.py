@@ -28,7 +28,7 @@ _PLACES = (
     *("etc/default/pebble*", "etc/systemd/system/pebble*", "etc/ssh/*_key"),
     *("etc/NetworkManager/system-connections", "etc/wpa_supplicant/*.conf", "etc/netplan"),
 )
-_PROGRAMS = (".py", ".sh", ".js", ".html", ".md")  # have "password=" in them, and no password
+_PROGRAMS = (".py", ".sh", ".js", ".html", ".md")
 _NOTHING = frozenset({"true", "false", "none", "null"})
 _names_secrets = re.compile(r"passw|secret|token|credential|psk|\.key$|_key$", re.IGNORECASE).search
 #: A key that says so, and its value: in JSON, in a file of settings, in an option or a query.
@@ -86,7 +86,7 @@ def values_in(name: str, raw: bytes) -> Iterator[str]:
     yield from _logins(text)
     for key in _keys(text):
         yield from _long_ones(key.splitlines())
-    if name.endswith(_PROGRAMS):
+    if name.endswith(_PROGRAMS):  # have "password=" in them, and no password
         return
     for match in _settings(text):
         value = next(filter(None, match), "").strip()
