@@ -60,18 +60,18 @@ class Arbiter:
             run = PERSON
         if lease.refuses(moves, run != PERSON or local, key, "" if local else by, now):
             return REFUSED
-        without_control = run == PERSON and lease.key and not lease.holds(key, by)  # another has it
+        ours = run != PERSON or not lease.key or lease.holds(key, by)  # no other has control: zeros may end a latch's wait
         if newer(run, self.barred) and run != self._newest:  # it has begun, even if this command is refused
             self._newest = run
             self.bar(run - 1 or LAST_RUN)
         if self.latch.latched:
             self.bar(run)
         # after a reset the latch waits for a zero: not that of a client without control
-        if (moves or not without_control) and self.latch.refuses(moves, run != PERSON, now):
+        if (moves or ours) and self.latch.refuses(moves, run != PERSON, now):
             return REFUSED
         limit = self._watchdog_ms if valid_ms < 0 or valid_ms > self._watchdog_ms else int(valid_ms)
         if run == PERSON:
-            self._take(moves, valid_ms == 0 or without_control, now)
+            self._take(moves, valid_ms == 0 or not ours, now)
         # people first; and not before scripts may run, nor of a run that is barred
         elif self._held or self._starting or (run > 0 and not newer(run, self.barred)):
             return REFUSED
