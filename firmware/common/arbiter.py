@@ -60,7 +60,7 @@ class Arbiter:
             run = PERSON
         if lease.refuses(moves, run != PERSON or local, key, "" if local else by, now):
             return REFUSED
-        ours = run != PERSON or not lease.key or lease.holds(key, by)  # no other has control: zeros may end a latch's wait
+        ours = run != PERSON or not lease.key or lease.holds(key, by)  # no other has control: a zero may end a latch
         if newer(run, self.barred) and run != self._newest:  # it has begun, even if this command is refused
             self._newest = run
             self.bar(run - 1 or LAST_RUN)
