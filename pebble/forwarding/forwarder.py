@@ -183,9 +183,9 @@ class Forwarder:
             return False  # it may be a live stop, with a name in its topic
         kind = self.subjects.invented(topic)
         if kind is None or (kind is Kind.FLAG and not self._admission.refuses_flag(topic)):
-            return False  # not invented, or an unknown flag for which there is room
+            return False  # the contract knows it, or it is an unknown flag for which there is room
         drop = Drop.TOO_MANY if kind is Kind.FLAG else Drop.STALE
-        self.sides[side].window.note()  # more may follow, an old stop among them
+        self.sides[side].window.note()  # while retained messages come, a stop may be an old one
         self.counters.add(f"{side.value}: {drop.value}")
         self._warn(drop, topic[:_LOGGED].decode(errors="replace"))
         return True

@@ -18,10 +18,10 @@ _UPLINK_S = 0.5  # TCP's round trips may be so much longer than usual: more may 
 
 
 class WaitingTime:
-    """The earliest time since which the next bytes may have waited in a socket; all times are of one clock.
+    """The earliest time at which the next bytes may have arrived in a socket; all times are of one clock.
 
-    Two facts are known: when the socket was last empty, and how many bytes were in it at one moment after that. Bytes
-    that are read after those have arrived later than that moment.
+    Two facts are known: when the socket was last empty, and how many bytes were in it at one moment after that. The
+    counted bytes have arrived after it was empty, all others after the moment of counting.
     """
 
     def __init__(self, now: float) -> None:

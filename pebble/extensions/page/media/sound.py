@@ -210,7 +210,7 @@ class SoundHub(Streams[SoundStream]):
     async def serve(
         self, websocket: WebSocket, ref: str, can: frozenset[str], session: Session, device: str = "", address: str = ""
     ) -> None:
-        """Serve a page that plays ``can`` and may talk, until either end closes the socket."""
+        """Serve a page that plays the encodings ``can`` and may talk, until either end closes the socket."""
         page = SoundPage(can & frozenset(BEST_FIRST["audio"]), session, device, address)
         await self.let_view(
             websocket, ref, page, lambda _: _send(websocket, page), lambda stream: _receive(websocket, stream, page)

@@ -1,4 +1,4 @@
-"""The files that a recorder is writing, one for each lane."""
+"""The files that a recorder is writing, one for each lane: the state of all robots, and the media of each robot."""
 
 from collections.abc import Callable, Iterator, Mapping
 from typing import Final

@@ -209,9 +209,9 @@ def _is_elsewhere(key: str, value: Any, below: str) -> bool:
 
 
 def _without_controls(section: Any, *, drives: bool) -> Any:
-    """Return the section with ``controls`` false, since a recording obeys no command.
+    """Return a section of capabilities with ``controls`` false, since a recording obeys no command.
 
-    ``drives``: it is the section ``drive``, which is not even available.
+    ``drives``: it is the section ``drive``, whose ``available`` becomes false, too.
     """
     if isinstance(section, list):
         return [_without_controls(value, drives=drives) for value in section]
