@@ -101,7 +101,7 @@ def untypeable(name: str) -> str:
 
 
 def meant(names: Iterable[str], typed: str) -> str:
-    """Return ``typed``, or else the name in ``names`` that looks the same on the screen, if there is one."""
+    """Return the name in ``names`` that looks like ``typed`` on the screen; ``typed`` if it is there, or none does."""
     if typed.isascii():
         return typed
     alike = [name for name in names if composed(name) == composed(typed)]

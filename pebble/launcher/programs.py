@@ -82,7 +82,7 @@ def program_of(instance: str) -> str:
 
 
 def _announcer(config: Config) -> Program:
-    """Return the program of the announcer, which on a Zenoh robot is the hub as well."""
+    """Return the program that publishes the launcher's messages; on a Zenoh robot it is the hub as well."""
     has_hub = config.transport.kind == "zenoh"
     name, stage = ("zenoh_hub", Stage.LOCAL_TRANSPORT) if has_hub else ("announcer", Stage.ANNOUNCER)
     hub = ("pebble.runtime.hub",) if has_hub else ()

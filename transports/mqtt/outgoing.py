@@ -157,12 +157,12 @@ class InFlightTable:
 
     @property
     def unacked(self) -> int:
-        """The number of DELIVERED messages that the broker has not acknowledged."""
+        """The number of messages of QoS 1 that the broker has not acknowledged."""
         return len(self._unacked)
 
     @property
     def waiting_since(self) -> float | None:
-        """Time since when DELIVERED messages wait and none was acknowledged; None if none waits."""
+        """Time since when messages of QoS 1 wait and none was acknowledged; None if none waits."""
         if not self._unacked:
             return None
         _, oldest_sent_at = next(iter(self._unacked.values()))

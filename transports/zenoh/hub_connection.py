@@ -22,7 +22,7 @@ GOODBYE_S = 0.3  # the longest wait for an answer when closing
 
 
 class HubConnection:
-    """The connection to a hub. Each hub that `watch` sees begins a new one. ``name``: this client's session."""
+    """The connections to hubs, one after the other: a new one for each hub that `watch` sees. ``name``: our session."""
 
     def __init__(
         self, client_id: str, will: Message | None, own: OwnRetained, count: Callable[[], object], account: str
@@ -36,7 +36,7 @@ class HubConnection:
         self.name = ""
         self.watch = HubWatch()
         self.lock = threading.Lock()  # no answer of a connection is offered after the next one began
-        self._connection = 0  # its number
+        self._connection = 0  # the number of the present one
 
     def open(self) -> None:
         """Begin a connection for a client that was opened, perhaps again."""
@@ -92,7 +92,7 @@ class HubConnection:
     def fetch(self, session: zenoh.Session, subscriptions: Iterable[Subscription], counts: dict[str, int]) -> None:
         """Ask for retained messages and wait for them, so that none arrives after messages published later.
 
-        ``counts``: how many retained messages each sibling has sent; the hub answers once it has received those.
+        ``counts``: how many retained messages each other process has sent; the hub answers once it has received those.
         """
         end = time.monotonic() + FETCH_S
         for answered in [self._query(session, subscription, counts) for subscription in subscriptions]:

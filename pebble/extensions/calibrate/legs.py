@@ -94,7 +94,7 @@ class Legs:
         return self._drive(name, (0.0, math.copysign(POWER, mm)), abs(mm) / self._mm_s, ends)
 
     def spin(self, name: str, turns: int) -> Counts:
-        """Spin ``turns`` on the spot by the counts, and on to the tag if there is one; negative is clockwise."""
+        """Spin ``turns`` on the spot; negative is clockwise. With a tag, the spin ends where it is seen as before."""
         way_mm = abs(turns) * math.pi * self._expected.track_width_mm  # of each wheel
         side = -math.copysign(1.0, turns)
         fast_mm = way_mm if self._finder is None else way_mm * _BEFORE_TAG

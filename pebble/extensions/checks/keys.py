@@ -63,13 +63,13 @@ def _meaning(field: FieldInfo) -> str:
 
 
 def _allowed(field: FieldInfo) -> str:
-    """Return the kind of value in words, unless the meaning shows it."""
+    """Return the kind of value in words; empty where the key's meaning shows it."""
     kind, metas = unwrap(field.type)
     if get_origin(kind) is tuple:
         return " A list."
     if get_origin(kind) is dict:
         return " An object."
-    has_limits = any(set(meta.extra or ()) - {"parse"} for meta in metas)  # "parse" is a function, no words
+    has_limits = any(set(meta.extra or ()) - {"parse"} for meta in metas)  # "parse" is a function, not a limit
     if kind in (bool, str) and not has_limits:
         return ""
     text = expected(kind, metas).partition(":")[0]  # of "a topic: 1 to 250 …" the first two words

@@ -274,9 +274,9 @@ def _scripts(config: Config) -> list[tuple[str, str]]:
 
 
 def _shared_broker(config: Config) -> Mqtt | None:
-    """Return the broker at which the robot's own processes and others meet; None if there is none.
+    """Return the broker that other programs, too, may use to reach the robot's own processes; None if there is none.
 
-    With Zenoh inside it is that of the mirror. With MQTT it is the local one, unless the bridge leads to another one.
+    With Zenoh inside it is that of the mirror. With MQTT it is the local one; None if operators have another one.
     """
     if config.transport.kind != "mqtt":
         return config.transport.mqtt_mirror

@@ -49,10 +49,10 @@ class NamedSubjects(Subjects):
 
 
 class Beginning:
-    """A stopwatch of starts of forwarding: if one takes long, commands wait at the broker behind retained messages.
+    """A stopwatch of starts of forwarding: if a start takes long, commands wait at the broker meanwhile.
 
-    :meth:`aged` marks these, so that stale ones are refused. Pings cannot tell the age of a command here: all robots
-    share a connection that is almost never idle.
+    :meth:`aged` adds that time to such commands, so that stale ones are refused. A robot's bridge measures the age of
+    commands by pings, which tells nothing here: all robots share a connection that is almost never idle.
     """
 
     LONG_S = 0.5  # what moves a robot may wait so long
