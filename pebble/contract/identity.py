@@ -9,7 +9,7 @@ from unicodedata import normalize
 
 from msgspec import Struct
 
-from pebble.errors import ConfigError
+from pebble.errors import ConfigError, PebbleError
 
 # ``/ + # $`` belong to MQTT; brokers close the connection on control characters and Unicode non-characters.
 _RESERVED = r"/+#$\x00-\x1f\x7f-\x9f\ufdd0-\ufdef\ufffe\uffff"
@@ -101,12 +101,14 @@ def untypeable(name: str) -> str:
 
 
 def meant(names: Iterable[str], typed: str) -> str:
-    """Return the name in ``names`` that looks like ``typed`` on the screen; ``typed`` if it is there, or none does."""
+    """Return ``typed``, or if it is no name, the one in ``names`` that looks like it. PebbleError if several do."""
     if typed.isascii():
         return typed
     alike = [name for name in names if composed(name) == composed(typed)]
     if typed in alike or not alike:
         return typed
+    if len(alike) > 1:
+        raise PebbleError(f"{len(alike)} names look like this: rename all but one")
     return alike[0]
 
 
