@@ -46,7 +46,7 @@ class Outgoing(Struct, frozen=True):
 
     waiting: int = 0  # bytes that the other machine has not confirmed, including some overhead of the protocols
     round_trip_s: float = 0.0  # the shortest of this connection: bytes that wait for less are merely travelling
-    stalled_s: float = 0.0  # how long DELIVERED messages wait and none was acknowledged, beyond two usual round trips
+    stalled_s: float = 0.0  # how long messages of QoS 1 wait and none was acknowledged, beyond two usual round trips
 
 
 class Answer(Struct, frozen=True):

@@ -1,4 +1,4 @@
-"""Programs that run only while another program requests them."""
+"""Programs that run only while another program requests them by notes to the launcher (pebble.runtime.notes)."""
 
 import logging
 from collections.abc import Iterable
@@ -17,7 +17,7 @@ log = logging.getLogger(__name__)
 
 
 class OnDemand:
-    """The requests in notes Wanted and Held: a program runs while it is wanted and not held. For one thread."""
+    """The requests in the notes Wanted and Held: a program runs while it is wanted and not held. For one thread."""
 
     def __init__(self, reactor: Reactor, supervisors: Iterable[ProcessSupervisor]) -> None:
         self._reactor = reactor

@@ -45,7 +45,7 @@ class Script(Struct, frozen=True, kw_only=True):
     ours: bool = False  # it uses pebble.script, which signs its drive commands and stops the wheels at its end
     broken: str = ""  # why it cannot be started
     asked: bool = True  # False: its settings and what it needs are not known yet
-    own_program: bool = False  # its manifest names what runs it
+    own_program: bool = False  # its `script.json` names what runs it
     drives: bool = True  # it may move the robot, so an emergency stop ends it
 
 

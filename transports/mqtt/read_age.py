@@ -57,7 +57,7 @@ class BrokerDelay:
     A ping that itself took long to get there, behind our own data, tells nothing. The usual time of an answer is no
     delay: it is that of the shortest answer of this connection, or TCP's own round trip.
 
-    A broker that stood still then reads a packet of each client in turn: it may have answered all our pings before it
+    A broker that has stood still reads a packet of each client in turn: it may have answered all our pings before it
     has read the last old message of another client. So if nothing at all has come since an overdue ping was sent, the
     messages of the next moment count as having waited as long.
 

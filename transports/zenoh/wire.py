@@ -173,7 +173,7 @@ def ask(session: zenoh.Session, key: str, payload: bytes, timeout: float) -> byt
 
 
 def account_of(key: str, what: str) -> str:
-    """Return the account in a query's key; empty: this machine. Raises ValueError for what no account may send."""
+    """Return the account in a key of :func:`asked`; "" for a process of this machine. Raises ValueError."""
     account = key.removeprefix(what).removeprefix("/")
     if not key.startswith(what) or "*" in account or "/" in account or OF in account:
         raise ValueError(f"{key} is no query of an account")

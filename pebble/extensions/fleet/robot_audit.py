@@ -1,6 +1,6 @@
 """The robot's audit: a log of JSON lines about who did what, which the bridge writes when commands pass.
 
-Forwarding never waits for it. It holds no driving commands, and no parameters or keys of others.
+Forwarding never waits for it. It holds no driving commands, and no parameters or keys of other commands.
 """
 
 import errno

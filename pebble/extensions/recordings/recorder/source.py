@@ -24,7 +24,7 @@ class Source:
     """A connection whose messages are recorded, and whose changes are recorded as events.
 
     With MQTT 5's retain-as-published it sees which live messages were published to be retained, but could not tell
-    those from older ones. Besides, brokers send only some 1,000 retained messages with QoS 1. So each connection to a
+    them from retained ones. Besides, brokers send only some 1,000 retained messages with QoS 1. So each connection to a
     broker has a second one, which fetches the retained messages with QoS 0 and ends.
     """
 
