@@ -203,7 +203,7 @@ class InFlightTable:
         return sent_at
 
     def topic_of(self, mid: int) -> str | None:
-        """Return the topic of a DELIVERED message that is not acknowledged; None if there is no such message."""
+        """Return the topic of a message of QoS 1 that is not acknowledged; None if there is no such message."""
         return self._unacked[mid][0] if mid in self._unacked else None
 
     def first_written(self, now: float) -> dict[str, int]:
