@@ -10,7 +10,7 @@ class Lease:
     """A lease. Pass requests to ``hold`` and ``release``, drive commands to ``refuses``; call ``tick`` regularly.
 
     A holder drives until 5 s after it got control or last moved something; after that a request gets control at once.
-    ``others`` is True while commands without a key come.
+    ``others``: True if a command without a key has passed here in the last 2 s.
     """
 
     def __init__(self, now: int, diff, random, strangers: int) -> None:

@@ -88,7 +88,7 @@ STEPS = (*(step.name for step in SCRIPT), EMERGENCY_STOP, AFTER_RESET)  # of eve
 
 
 class EndedEarlyError(Exception):
-    """An error that ends a step: the demo ends, or a person has taken the robot with the script."""
+    """An error that ends a step: the demo ends, or a person has taken the robot that runs a script."""
 
 
 class Operator:
