@@ -54,15 +54,15 @@ class _Clock:
 
     @property
     def standing(self) -> tuple[float, float]:
-        """Sort key for forgetting clocks: received for the shortest time first, then silent for the longest."""
+        """Sort key for forgetting clocks: first those with messages over the shortest time, then the longest silent."""
         return self.received_at - self.began, self.received_at
 
 
 class SenderClocks(Generic[K]):
     """The clocks of at most ``most`` senders, each identified by a key.
 
-    If there is no room, a silent sender is forgotten, or else the sender that was received for the shortest time: a
-    flood of invented keys does not displace a sender that continues.
+    If there is no room, a silent sender is forgotten. If none is silent, it is the sender with the shortest time from
+    its first to its last message: a flood of invented keys does not displace a sender that continues.
     """
 
     def __init__(self, most: int, patience: Patience) -> None:
@@ -100,7 +100,7 @@ class SenderClocks(Generic[K]):
             return clock is not None and clock.newest - _JUMP_S < sent < clock.newest
 
     def pass_over(self, key: K, sent: float, now: float) -> None:
-        """Note the stamp of a message that is not judged, so that :meth:`is_passed` finds the sender's earlier ones."""
+        """Note the stamp of a message that is not judged, so that :meth:`is_passed` recognises older ones."""
         with self._lock:
             clock = self._clocks.get(key)
             if clock is not None and sent - clock.newest < now - clock.received_at + _JUMP_S:

@@ -100,8 +100,8 @@ class Subscription:
     def offer(self, message: Message, *, repeat: bool = False) -> None:
         """Queue ``message``, unless it is a retained message of a topic this connection has already delivered (T5, T8).
 
-        A policy with ``delivers_late`` wants it all the same. As-published connections cannot distinguish retained from
-        live messages; their backend sets ``repeat`` when it is sure that the message is a repetition.
+        With ``policy.delivers_late`` such a message is queued, too. Where ``transport.as_published``, retained and live
+        messages look alike; there the backend sets ``repeat`` when it is sure that the message is a repetition.
         """
         transport = self._transport
         with self._lock:
@@ -506,8 +506,8 @@ class Transport(ABC):
 
     @abstractmethod
     def _declare(self, subscription: Subscription) -> None:
-        """Activate ``subscription`` (already listed); wait, for a limited time, until it is certainly active."""
+        """Activate a subscription in ``_subscriptions``; wait, for a limited time, until it is certainly active."""
 
     @abstractmethod
     def _undeclare(self, subscription: Subscription) -> None:
-        """Deactivate ``subscription`` (no longer listed)."""
+        """Deactivate ``subscription``, which is no longer in ``_subscriptions``."""

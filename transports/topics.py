@@ -32,7 +32,7 @@ def remembered(translate: Callable[[str], str]) -> Callable[[str], str]:
 
 
 def _check(what: str, text: str) -> None:
-    """Raise TransportError if ``text``, a topic or a filter as ``what`` says, is beyond the limits of both."""
+    """Raise TransportError if ``text`` breaks a limit of topics and filters alike; ``what`` says which it is."""
     if not isinstance(text, str) or not text:
         raise TransportError(f"{what} must be a non-empty string, not {text!r}")
     try:

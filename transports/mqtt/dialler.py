@@ -125,7 +125,7 @@ class Dialler:
         return not self._asks_for_bridge_mode or self._bridge_mode.next_attempt is Attempt.BRIDGE
 
     def _note_result(self, result: Result) -> None:
-        """Note how a CONNECT has ended; limits are learned only once bridge mode is decided."""
+        """Note how a CONNECT has ended. While bridge mode is undecided, hanging up tells nothing about limits."""
         self._bridge_mode.note(result)
         if self._will is not None and (self._is_last_attempt or result is not Result.HUNG_UP):
             self.limits.note_connect(result, time.monotonic())
@@ -167,11 +167,11 @@ class Dialler:
         return self.loses_large
 
     def is_gone(self, lost: Lost, *, connected: bool, was_ended: bool) -> bool:
-        """True if the broker's process seems to have ended. ``was_ended``: the result after the loss before this one.
+        """True if the broker's process seems to have ended. ``was_ended``: the result of the last call.
 
         1. A connection was lost (``connected``): True, unless the broker was only silent. It may be we who stood still.
-        2. An attempt to connect has failed: ``was_ended`` if nothing listens there. For `_ENDING_S` after that, or the
-           loss, a broker that ends may still hang up: ``was_ended``, too, unless it was silent. Otherwise False.
+        2. An attempt to connect has failed: ``was_ended`` if nothing listens there. For `_ENDING_S` after that or after
+           1, a broker that ends may still hang up: then ``was_ended``, too, but False after silence. Later False.
         """
         now, was_silent = time.monotonic(), isinstance(lost, Silent)
         if connected:

@@ -59,10 +59,10 @@ class BrokerDelay:
 
     A broker that has stood still reads a packet of each client in turn: it may have answered all our pings before it
     has read the last old message of another client. So if nothing at all has come since an overdue ping was sent, the
-    messages of the next moment count as having waited as long.
+    messages of the next moment count as having waited as long as the ping.
 
-    Answers carry no number, and mosquitto drops them where a client's queue is full: later answers then count for
-    pings before theirs. A later PUBACK shows that; so do answers that always come right after the newest ping.
+    Answers carry no number, and mosquitto drops some where a client's queue is full: each later answer then counts for
+    an earlier ping. A PUBACK shows that, and so do several answers in a row that come right after the newest ping.
     """
 
     def __init__(self) -> None:

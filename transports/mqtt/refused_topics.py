@@ -24,7 +24,7 @@ _NOT_TAKEN_S = 600.0  # between two log lines about one topic
 
 
 class Withheld(NamedTuple):
-    """A topic whose messages are not sent, until it is tried: messages of ``size`` bytes and more."""
+    """A topic whose messages of ``size`` bytes and more are not sent; it is tried again from ``tried_at`` on."""
 
     size: int
     tried_at: float

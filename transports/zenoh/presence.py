@@ -29,7 +29,7 @@ class HubView(msgspec.Struct, frozen=True):
 
 
 class HubWatch:
-    """A watch for hubs, and for connections that were interrupted. A waiter always gets the newest view."""
+    """A watch for hubs, and for connections that were interrupted. :meth:`wait` returns the newest :class:`HubView`."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()

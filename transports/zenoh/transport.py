@@ -202,7 +202,7 @@ class ZenohTransport(Transport):
         """Process a change of hubs or connections; return the serial number of the working hub connection, 0 for none.
 
         The number grows with each hub that appears. ``linked``: the result of the last call, or 0 after an error;
-        ``seen``: the version of the view then. Without a change this is another try, after a failed one.
+        ``seen``: the version of that call's view. If ``view`` still has it, this is another try after a failed one.
         """
         if not view.hubs:
             self.problem = f"the hub of {self.settings.run_dir} is away"

@@ -90,7 +90,7 @@ class Stamp(msgspec.Struct, frozen=True):
     """The origin of a retained message. ``retained_count`` 0: it was sent again, or the hub made it.
 
     The fields are not checked, because a hub is not told from which session a message has come. So a client that may
-    retain on a topic can forge them: a session then skips that message, or a query is answered half a second too early.
+    retain on a topic can forge them: a session then skips that message as its own, or a query is answered 0.5 s early.
     """
 
     qos: QoS

@@ -51,7 +51,7 @@ class HubStore:
             yield StoredWill(name, will)
 
     def lacks(self, hello: Hello) -> list[str]:
-        """Return the keys that this client should send: those missing here, and those whose value it has changed since.
+        """Return the keys that this client should send: those missing here, and those with an older value of its own.
 
         A later value, or removal, by another client stays.
         """
