@@ -394,8 +394,8 @@ def call(
 ) -> Any:
     """Call function ``hook`` of an extension and return its result.
 
-    ``finish`` converts the result within the same guard. Raises ConfigError with the extension and the hook if the
-    call fails or returns no ``kind``.
+    ``finish`` converts the result. Raises ConfigError with the extension and the hook if the call or ``finish`` fails,
+    or if the result is no ``kind``.
     """
     try:
         value = finish(part(getattr(extension, hook))(*arguments))

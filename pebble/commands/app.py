@@ -105,7 +105,7 @@ class _Listed(TyperCommand):
         return command.make_context(info_name, args, parent, **extra)
 
     def _command(self, arguments: list[str]) -> Any:
-        """Return the loaded command; if ``arguments`` begin with a subcommand of the table, the group of those."""
+        """Return the loaded command, or the group of its subcommands in the table if ``arguments`` begin with one."""
         listed: dict[str, Any] = {
             words.split()[1]: _Listed(words, self._offered)
             for words in self._offered

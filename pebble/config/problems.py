@@ -42,7 +42,7 @@ class Notes:
     def forget_inherited(self, written: Any, merged: Any) -> None:
         """Remove notes about values that a serial line inherits: they are noted at the section that has them.
 
-        ``merged`` is ``written`` with the inherited values (raw.with_instances). Notes of keys in neither stay.
+        ``merged`` is ``written`` with the inherited values (raw.with_instances). All other notes stay.
         """
         for notes in (self.problems, self.warnings, self.retired):
             notes[:] = [note for note in notes if holds(written, note.path) or not holds(merged, note.path)]

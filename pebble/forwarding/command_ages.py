@@ -1,8 +1,8 @@
 """Ages of commands, by the clocks of their senders.
 
 Pings show an age as well. But on a thin link it includes the wait for the ping's own way *up*, behind pictures. A drive
-command with a stamp ``t`` and a ``key`` needs no pings once an earlier one with this key was fast. In a request for
-control, ``id`` takes the place of the key.
+command with a stamp ``t`` and a ``key`` needs no pings once an earlier command with this key came without delay. In a
+request for control, ``id`` takes the place of the key.
 """
 
 from math import inf

@@ -1,7 +1,7 @@
 """Detects messages that circulate: we forward them, and something else brings them back. Pure.
 
-A broker's own bridge, or a second robot with this id, may forward the same topics. A probe that we publish on one side
-and receive on the other proves it for its topic. It is sent on that very topic, because what brings messages back may
+A broker's own bridge, or a second robot with this id, may forward the same topics. If a probe that we publish on one
+side comes back on the other, its topic circulates. It is sent on that very topic, because what brings messages back may
 carry no other. Its payload is white space that encodes a random number, which no parser of commands accepts. On topics
 other than commands it follows the topic's value, which white space does not change.
 """
@@ -54,14 +54,14 @@ class Finding(Enum):
 class _Way(Struct):
     """The messages of one topic that are forwarded from one side to the other, counted to find cycles."""
 
-    began: float
-    counts: dict[int, int] = {}  # of payloads, by their hash, since then
+    began: float  # when the present period of counting began, of _WINDOW_S
+    counts: dict[int, int] = {}  # of payloads, by their hash, in this period
     probed_at: float = float("-inf")
     unanswered: int = 0  # probes since the last one that came back
     closed: bool = False  # what is forwarded this way comes back
 
     def count(self, payload: bytes, now: float) -> int:
-        """Count a message; return how often its payload came since ``began``, 0 if there are too many payloads."""
+        """Count a message; return how often its payload came in this period, 0 if there are too many payloads."""
         if now - self.began > _WINDOW_S:
             self.began, self.counts = now, {}
         key = hash(payload)
@@ -201,7 +201,7 @@ def _usual_count(subject: Subject) -> int:
     """Return how many equal messages within 2 s are normal; more of them start a probe.
 
     The first message of an action is probed already, before the action can run twice. Another command that runs
-    something is probed at its first repetition, and the rest after some, so that other programs seldom see a probe.
+    something is probed at its first repetition, all others after several, so that other programs seldom see a probe.
     """
     if subject.kind.direction == OUTGOING:
         return STORM

@@ -84,8 +84,8 @@ class Publisher:
     def probe_again(self, sides: tuple[Side, ...], value: Callable[[str], bytes | None]) -> None:
         """Probe topics that circulated; if any circulates, also all commands from ``sides``. Call this once a second.
 
-        ``value`` returns the newest value of a topic. Commands were probed when the connection began, but the other way
-        may have been set up since.
+        ``value`` returns the newest value of a topic. Commands were probed when the connection began, but what brings
+        them back may have been set up later.
         """
         for side, topic in self._cycles.poll():
             self.probe(side, topic, value(topic) or b"")

@@ -70,7 +70,7 @@ class RetainedTopics:
             return forward
 
     def open(self) -> None:
-        """Open the gate, and publish the messages that have waited."""
+        """Open the gate between the sides, and publish the messages that have waited."""
         with self._lock:
             self._sides.gate = Gate.OPEN
             waiting, self._waiting = self._waiting, {}
@@ -78,7 +78,7 @@ class RetainedTopics:
                 self._publish(Side.REMOTE, subject, message, forward)
 
     def shut(self) -> None:
-        """Close the gate. Takes no lock: a loop of messages must end at once."""
+        """Close the gate: nothing passes any more. Takes no lock, as a loop of messages must end at once."""
         self._sides.gate = Gate.SHUT
         self._waiting = {}
 
@@ -154,7 +154,7 @@ class RetainedTopics:
         return source.window.may_be_old(message) and not self._reconciliation.has_received(source.side, message.topic)
 
     def _begin_restarted(self) -> None:
-        """Forget what a side has sent if its connection was lost since: its retained messages come again."""
+        """Forget what a side has sent on an earlier connection: on the new one its retained messages come again."""
         for state in self._sides.values():
             if state.restarted:
                 state.restarted = False

@@ -21,7 +21,7 @@ _HOLDER = -2  # in place of the number of a run: the holder of control
 class ReceivedDrive(Struct, frozen=True):
     """A drive command, with the time at which it was received.
 
-    ``company``: the members of its group that this motor owner takes, such as lights; all are carried out, or none.
+    ``company``: this motor owner's other commands in the same message (a group), such as lights; all count, or none.
     """
 
     drive: p.Drive

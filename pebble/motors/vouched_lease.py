@@ -9,8 +9,8 @@ _IDLE_MS, _OTHERS_MS = 5000, 2000  # as in Lease
 class VouchedLease(Lease):
     """A lease that does not take its holder for silent because messages were held up.
 
-    Silence counts only in periods for which the bridge vouches: those of which it has passed on every message. After
-    ``ENDS_AFTER_MS`` it counts in any case.
+    Silence counts only in periods for which the bridge vouches, because it has passed on every message that came in
+    them. After ``ENDS_AFTER_MS`` it counts in any case.
     """
 
     vouched: tuple[int, int] | None = None  # begin and end; None: there is no bridge, and all time counts

@@ -59,7 +59,7 @@ class Owner:
         self.withdrawn_at: float | None = None  # since when it publishes that it has no emergency stop
 
     def confirms(self, name: str) -> bool:
-        """True if the owner's newest state names this stop, unless the owner is latched and could not save that."""
+        """True if the owner's newest state names this stop, except while a latched owner still has to save it."""
         state = self.state
         return state is not None and name in state.recent and (state.persisted is not False or not state.latched)
 

@@ -190,7 +190,7 @@ class MqttBridge(ForwardingService):
             self._publish_heartbeat()
 
     def _look_later(self) -> None:
-        """Look for messages that only the remote side retains, once all of the robot's must be known."""
+        """Look for messages that only the remote side retains, when all services have had time to publish theirs."""
         if self._leftovers.done:
             return
         if self._leftover_timer is not None:

@@ -34,7 +34,7 @@ class MqttMirror(ForwardingService):
     Where retained messages differ at a reconnect, the local side is right. If a probe of the bridge arrives from the
     broker, that broker is the remote one: the bridge serves it already, and with a second path messages would
     circulate. A probe counts only if the bridge has announced it on the local side. A heartbeat from the broker is a
-    reason to request one.
+    reason to request a probe.
     """
 
     name = "mqtt_mirror"

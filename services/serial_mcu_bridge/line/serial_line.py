@@ -245,7 +245,7 @@ class SerialLine:
                 self.output.check_stall(port, now)
 
     def _finish(self, port: Port) -> None:
-        """Wait up to 0.3 s until the last stop is sent; if the device is stuck, the stop replaces what waits there."""
+        """Wait up to 0.3 s until the last stop is sent; if the device is stuck, replace what is unsent by the stop."""
         end = time.monotonic() + _DRAIN_S
         while time.monotonic() < end:
             with self._lock:
