@@ -2,11 +2,11 @@
 
 A change that no test notices survives: no test asserts what the line does, or the line is not needed. Tests run in a
 copy of the tree, collected once; for each change, a forked process replaces the code of its function and runs the rows
-that reach its line: programs that tests start do not have it. A line that runs while tests are imported (a constant, a
-class body, a default) is changed in the copy and tried by all rows in a new process, which takes seconds. Calls that
-log are counted apart. A hang counts as killed. A row is a test function with its parameters, an arc a step from one
-line to the next. A page module is changed in the copy and tried by all rows; those of tests/ext/page/modules, which run
-in Node, if no others are named. What is inside its strings and templates is not changed.
+that reach its line. Programs that tests start run unchanged code. A line that runs while tests are imported (a
+constant, a class body, a default) is changed in the copy and tried by all rows in a new process, which takes seconds.
+Calls that log are counted apart. A hang counts as killed. A row is a test function with its parameters, an arc a step
+from one line to the next. A page module is changed in the copy and tried by all rows; if no tests are named, by those
+of tests/ext/page/modules, which run in Node. What is inside its strings and templates is not changed.
 """
 
 import argparse
@@ -139,7 +139,7 @@ def replacements(node: Any) -> Iterator[tuple[str, Any, ast.AST]]:
 
 
 def tests_that_import(files: list[str]) -> list[str]:
-    """Return the test files that import one of these files, also indirectly; those of page modules are a folder."""
+    """Return the test files that import one of these files, also indirectly; for page modules, a folder of tests."""
     if all(file.endswith(".js") for file in files):
         return ["tests/ext/page/modules"]
     packages = {"tests", *(path.parent.name for path in ROOT.glob("*/__init__.py"))}
@@ -254,7 +254,7 @@ class Trial:
         return True
 
     def read_rows(self) -> None:
-        """Read which rows pass without a mutant, fast modules first; name the rows that do not pass."""
+        """Read which rows pass without a mutant, fast modules first; print the names of the rows that fail."""
         passed = json.loads(self.passed.read_text())  # by the name of a row: its seconds, and its arcs
         module_of = {name: self.items[name].path for name in passed}
         self.slowest: defaultdict[Path, float] = defaultdict(float)  # seconds of a module's slowest row
@@ -283,7 +283,7 @@ class Trial:
     def run_rows(self, names: list[str], stop: bool) -> dict[str, Any]:
         """Run rows, or only up to the first that fails if ``stop``; return the seconds and arcs of those that pass.
 
-        The file ``failed`` then has the others.
+        The file ``failed`` then names the rows that failed.
         """
         passed, failed = {}, ""
         for number, (name, following) in enumerate(itertools.zip_longest(names, names[1:]), 1):

@@ -48,8 +48,8 @@ class Arbiter:
 
         ``moves``: any axis is not 0. ``run`` may be PERSON, or UNKNOWN_RUN for a zero. ``valid_ms`` < 0: not given.
         ``key`` and ``by`` are as in the lease; ``by`` None: a program of the robot, which needs no key. Where names are
-        not checked, scripts need none either. A zero of a client without control ends a script, too, but not the
-        latch's wait for a zero after a reset.
+        not checked, scripts need none either. A zero of a client without control ends a script, even one that waits,
+        but it is not the zero for which the latch waits after a reset.
         """
         self.tick(now)
         lease = self.lease
@@ -106,8 +106,8 @@ class Arbiter:
     def _take(self, moves: bool, final: bool, now: int) -> None:
         """Handle a person's command: scripts wait, or end. ``final``: a zero ends them in any case.
 
-        Any other zero ends a script only if that was driving until now. After an earlier command of the person it
-        waits already: then the zero ends only the person's own driving, and the script goes on after the hold.
+        A zero that is not ``final`` ends a script only if the script was driving until now. If it waits already, after
+        an earlier command of the person, it goes on after the hold: the zero ends only the person's own driving.
         """
         if not moves and (final or self._scripted):
             self.bar(self._newest)

@@ -47,7 +47,7 @@ def microphone(options: AvDaemon, start: float) -> Opener:
 def asked_of_camera(video: CameraCapture) -> Asked | None:
     """Return the rate and size that a camera is asked for; None for a synthetic camera.
 
-    A file or a network stream cannot be asked for any.
+    For a file or a network stream, which cannot be asked, it is ``Asked()``: any rate and size.
     """
     if video.backend == "synthetic":
         return None

@@ -69,7 +69,7 @@ class ComputedDevice:
 
 
 class ComputedCamera(ComputedDevice, ABC):
-    """A camera that draws a picture at each turn; turns also count while there are no readers."""
+    """A camera that draws a picture at each turn of a :class:`Pacer`, which also counts while there are no readers."""
 
     def __init__(self, video: CameraCapture, start: float) -> None:
         self._shape = (video.height, video.width, 3)
@@ -82,7 +82,7 @@ class ComputedCamera(ComputedDevice, ABC):
 
     @abstractmethod
     def draw(self, picture: Bytes) -> None:
-        """Draw the chosen picture into an array of shape (height, width, 3)."""
+        """Draw the picture that :meth:`look` has chosen into an array of shape (height, width, 3)."""
 
     def grab(self) -> Capture:
         at_ns = self.look(self._pacer.next())

@@ -42,8 +42,8 @@ class Clips:
     def scan(self) -> list[str]:
         """Return the names of clips, sorted without regard to case.
 
-        At most 256 KiB of names; ``find`` knows the others, too. A file to which a link leads outside of the folder is
-        left out, also by ``find``.
+        At most 256 KiB of names; ``find`` also knows those beyond. A link to a file outside of the folder is left out,
+        also by ``find``.
         """
         self.problem = ""
         root = self._folder.resolve()

@@ -51,8 +51,8 @@ def hub_file(keys: str) -> dict[str, Any]:
 def boards_file(fleet: Fleet, name: str, below: str) -> dict[str, Any]:
     """Return the config file of the gateway for boards whose account is ``name``; its password's file is beside it.
 
-    At the LAN's hub the gateway connects for each board, by the board's account as a neighbour. ``below``: the prefix
-    in that file for paths of certificates, which are in the fleet's folder.
+    The gateway also connects to the LAN's hub, once for each board, with the account that the board has as a neighbour.
+    ``below``: the prefix in that file for paths of certificates, which are in the fleet's folder.
     """
     server, ca = fleet.brokers[0], below + certificates.CA_CERT
     login = {"username": name, "password_file": f"{name}-password", "tls": {"enabled": True, "ca_cert": ca}}

@@ -115,7 +115,7 @@ class Audit(Observer):
                     self.note(channel.kind.name.lower(), _sender(by), **_place(by), name=name, on=on)
 
     def refused(self, drop: Drop, channel: Channel | None, by: str | None) -> None:
-        """Add a row for a refused message; beyond OF_STRANGERS different rows in a window, only their number."""
+        """Add a row for a refused message; after OF_STRANGERS different ones in a minute, more are only counted."""
         if drop in _REFUSED:
             name, who = "" if channel is None else channel.metric, _sender(by)
             row = {"t": round(time.time(), 3), "what": "refused", "who": who, **_place(by), "name": name}

@@ -213,7 +213,7 @@ class MediaFeed:
                     self._publish(convert, waiting)
 
     def _converters(self, waiting: Waiting) -> list[tuple[Callable[[str, bytes], Converted | None], str]]:
-        """Return how this payload is converted for each channel that can show it, with the end of its topic."""
+        """Return a converter for each channel that can show this payload, with the end of the channel's topic."""
         if self._medium == "audio":
             return [(self._media.sound, SOUND.ending)]
         image = (self._media.image, IMAGE.ending)

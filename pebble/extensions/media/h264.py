@@ -44,8 +44,8 @@ def quality_to_crf(quality: float) -> float:
 class H264Encoder:
     """An encoder of BGR pictures to access units; ``interval``: pictures from one key frame to the next.
 
-    Another size or quality starts a new encoder, with a key frame. So does a picture that stays the same: its key frame
-    is sharp, and the following units change nothing in it.
+    Another size or quality starts the codec anew, with a key frame. So does a picture that has stayed the same for a
+    second: this key frame is coded sharply, and the units after it change nothing.
     """
 
     def __init__(self, fps: float, interval: int) -> None:

@@ -76,7 +76,7 @@ class PictureSequence:
         return header
 
     def interrupt(self) -> None:
-        """Treat the picture before the next one as missing."""
+        """Treat the next picture as one that follows a missing picture."""
         self.complete, self._last = False, None
 
 

@@ -1,7 +1,8 @@
 """Limits of the age of one page's messages, from pings that the page echoes. Pure: times are passed in.
 
 The page's clock has an unknown offset. An echo carries the page's time at some moment between the sending of the ping
-and the arrival of the echo, which limits the offset on both sides. So the age includes a delay that never changes.
+and the arrival of the echo, which limits the offset on both sides. A message counts as old as these limits allow, so
+that no constant delay is overlooked.
 """
 
 from collections import deque

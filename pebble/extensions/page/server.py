@@ -160,7 +160,7 @@ class Server:
         send(self._publish_stop, messages)
 
     def _publish_stop(self, topic: str, payload: bytes, *, qos: QoS) -> bool:
-        """Publish on the stops' own connection, or if that does not accept it on the other."""
+        """Publish on the stops' own connection or, if that does not accept the message, on the general one."""
         return self.stop_broker.publish(topic, payload, qos=qos) or self.broker.publish(topic, payload, qos=qos)
 
     def _stop_by_heartbeats(self, now: float) -> None:

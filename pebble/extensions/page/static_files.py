@@ -74,7 +74,7 @@ class StaticFiles:
         return b"\n".join(links)
 
     def _imported(self, *names: str) -> list[str]:
-        """Return the modules that these import before they run, also indirectly."""
+        """Return the modules that the modules ``names`` import before they run, also indirectly."""
         modules = list(names)
         for name in modules:  # it grows meanwhile
             for path in _IMPORT.findall(self.files.get(name, b"")):

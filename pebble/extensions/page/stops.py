@@ -181,7 +181,7 @@ class Stops:
         )
 
     def _note_progress(self, stop: _PressedStop, ref: str) -> None:
-        """Mark a robot as changed if pages were shown another progress of its stop."""
+        """Mark a robot as changed if the present progress of its stop is not the one that pages were shown."""
         robots = stop.sender.robots
         if ref in robots and self._shown.get(ref) != _progress(robots[ref]):
             self.changed.add(ref)

@@ -43,7 +43,7 @@ def encoded(members: Iterable[groups.Member]) -> bytes:
 
 
 def copy_of(member: groups.Member) -> bytes:
-    """Return the payload for programs that know no groups; marked as a copy if its owner takes the group itself."""
+    """Return the payload for programs that know no groups; on a channel in MARKED it is marked as a copy."""
     if member.channel not in MARKED:
         return member.payload
     return msgspec.json.encode(msgspec.json.decode(member.payload) | {groups.MARK: True})

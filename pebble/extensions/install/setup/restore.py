@@ -90,9 +90,9 @@ def _content(file: Path) -> bytes:
 
 
 def _allowed(files: dict[str, Saved], places: Places) -> dict[str, Saved]:
-    """Return the files to restore. Of mosquitto's only the broker's folder is among them, without its links.
+    """Return the files to restore. Of mosquitto's files only those of the broker's folder are among them, but no links.
 
-    Those, and the configuration that mosquitto includes, are made anew, as the backup may have been changed.
+    Links, and the configuration that mosquitto includes, are made anew, as the backup may have been changed.
     """
     folder = f"{places.broker_folder.relative_to(places.root)}/"
     links = [f"{folder}{name}" for name in own_broker.LINKS]

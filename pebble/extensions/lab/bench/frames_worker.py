@@ -2,7 +2,7 @@
 
 ``python -m pebble.extensions.lab.bench.frames_worker VARIANT ROLE WHERE SIZE``: ``WHERE`` is a folder for sockets, or a
 broker's port; ``SIZE`` is ``640x480``. For GStreamer this file runs as a plain file in the system's Python, where gi
-and Gst are installed; then it imports only the standard library, numpy and the other end of a worker. Without arguments
+and Gst are installed; then it imports only the standard library, numpy and worker_end.py. Without arguments
 it only loads GStreamer, and fails if that is not installed.
 
 A frame begins with the time at which its pixels were complete (CLOCK_MONOTONIC, ns). A process writes

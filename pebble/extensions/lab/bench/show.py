@@ -105,7 +105,7 @@ def spread(cell: Cell | None) -> str:
 
 
 def compared(ours: Cell | None, base: Cell | None, percent: float = 50) -> str:
-    """Return the ratio to the baseline as text; empty for the baseline itself, or if there is none."""
+    """Return the percentiles' ratio as text; empty if ``ours`` is the baseline ``base`` itself, or one is missing."""
     if ours is None or base is None or ours is base:
         return ""
     return str(ratio(ours, base, percent))

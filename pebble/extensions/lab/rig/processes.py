@@ -41,10 +41,10 @@ def unchanged(command: Sequence[str]) -> Sequence[str]:
 
 
 class Program:
-    """A child process in a session of its own: Ctrl-C in a terminal reaches only this process, which ends it in order.
+    """A child process in a session of its own: Ctrl-C in a terminal reaches only its parent, which ends it in order.
 
-    Start programs from the main thread: when the thread that started them ends, the kernel ends them. A program with
-    input, such as a worker, ends when that closes instead.
+    Start programs from the main thread: when the thread that started them ends, the kernel ends them. Only a program
+    with input, such as a worker, is not tied to that thread: it ends when its input closes.
     """
 
     has_input: ClassVar = False

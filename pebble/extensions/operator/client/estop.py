@@ -218,10 +218,10 @@ class StopSender:
     """An emergency stop, of named robots or of all, until it is confirmed, ended, or 60 s old.
 
     Publish what ``tick`` returns, pass every message of the robots' ``outgoing/#`` to ``receive``, and call ``tick``
-    again afterwards and at ``due``. Times are seconds of one monotonic clock. A ``hold`` lasts until ``end``.
+    again afterwards and at ``due``. Times are seconds of one monotonic clock. With ``hold`` it never gets too old.
 
     A stop of all robots is sent to each robot that publishes anything. To those in ``robots`` it is repeated until they
-    confirm it. If there are too many, the stops of the others count as ``omitted``.
+    confirm it. Messages of robots for which there is no room in ``robots`` count as ``omitted``.
     """
 
     def __init__(

@@ -116,7 +116,7 @@ def _parse(words: list[str]) -> tuple[str, str | None]:
 
 
 def me(account: str | None = None) -> str:
-    """Return the sender of this command: the account, or else the user, and the machine: ``ann@desk``."""
+    """Return the sender of this command, such as ``ann@desk``: the account (without one, the user) at this machine."""
     try:
         user = account or getpass.getuser()
     except (ImportError, KeyError, OSError):  # no name for this user id, or no such ids

@@ -151,7 +151,7 @@ class Drivers:
         self._publish(self.robot(ref).update(clock()))
 
     def renew_keys(self) -> None:
-        """Renew the keys that this server itself chooses, because the connection to the broker is new."""
+        """Choose new keys for robots whose motor owners give none, because the connection to the broker is new."""
         for robot in self._driven.values():
             robot.renew_key()
 

@@ -117,7 +117,7 @@ class _Playing:
         self._problem = ""
 
     def play(self, make: Make, rules: Rules, make_player: Callable[..., Player]) -> Player:
-        """Replay for these robots. Raises TransportError."""
+        """Replay for the robots of ``rules``. Raises TransportError."""
         robots = ReplayedRobots(make, rules.robots)
         with handled_by(self._end), robots:
             output = BusOutput(rules, robots.publish, time.time_ns)

@@ -265,7 +265,7 @@ def stamped(message: Any, ns: int) -> bytes:
 
 
 def time_of(payload: bytes, received_ns: int, publish_ns: int = 0) -> int:
-    """Return the payload's stamp, or else the time at which it was received."""
+    """Return ``publish_ns`` or, if it is 0, the payload's stamp; without a plausible one, ``received_ns``."""
     stamp = publish_ns or stamp_ns(payload)
     return stamp if stamp >= CLOCK_FROM_NS else received_ns
 

@@ -29,7 +29,7 @@ Read = Callable[[int, int], bytes]
 
 
 class Found(NamedTuple):
-    """A record that was found, with its place; of a chunk, what its indexes hold if none of them is damaged."""
+    """A record with its place; of a chunk also its channels (none if an index is damaged) and number of messages."""
 
     op: int
     at: int

@@ -52,9 +52,10 @@ class Due:
         self._checked: tuple[int, int] | None = None  # both clocks at the last call of suspended_s
 
     def every(self, what: str, seconds: float) -> bool:
-        """True if the task ``what`` is due: ``seconds`` have passed since it was due last, or first asked for.
+        """True if the task ``what`` is due: ``seconds`` have passed since it was due last.
 
-        If it is first asked for later than ``seconds`` after the start, it is due at once.
+        The first time, it is due ``seconds`` after the first call for it, or at that call if this object is that old
+        already.
         """
         now = self._boot_ns()
         if now - self._done.get(what, self._began) < seconds * 1e9:

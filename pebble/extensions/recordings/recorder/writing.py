@@ -85,7 +85,7 @@ class Writing:
     # -- messages
 
     def add(self, item: Item) -> None:
-        """Write a message, or carry out an order of the queue. Never raises."""
+        """Write a message or an event, or forget retained values, as the item says. Never raises."""
         try:
             self._add(item)
         except Exception:  # noqa: BLE001  one message must not take others with it

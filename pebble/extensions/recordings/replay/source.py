@@ -51,7 +51,7 @@ class ReplaySource:
 
 
 def _is_state(message: Recorded) -> bool:
-    """True if a new subscriber would get the message at once; an empty one removes the retained message."""
+    """True if a new subscriber would get the message at once. False if it is empty, to remove a retained one."""
     levels = message.channel.topic.split("/", 3)
     suffix = levels[3] if len(levels) > 3 else ""
     if not message.payload or not suffix.startswith(f"{OUTGOING}/") or suffix in _HEARTBEATS:

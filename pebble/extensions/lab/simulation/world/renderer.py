@@ -132,7 +132,7 @@ class Renderer:
         return np.asarray(self._middle[0] + self._focal * plan[..., 1] / plan[..., 0])
 
     def _rows(self, surface: Surface, plan: _Floats) -> _Floats:
-        """Return the rows in the picture of top and bottom, at both edges."""
+        """Return the picture's rows of the surface's top and bottom: a pair for its left edge, one for its right."""
         heights = self._lens.height_m - np.array((surface.top, surface.bottom))
         return np.asarray(self._middle[1] + self._focal * heights[None] / plan[:, :1])
 

@@ -34,7 +34,7 @@ class KeyDecoder:
         return self._since + ALONE_S if self._waiting else None
 
     def feed(self, data: bytes, now: float) -> list[str]:
-        """Return the keys in ``data``, in order: a printable character in lower case, or one of the names above."""
+        """Return the keys in ``data``, in order: a printable character in lower case, or a name such as ESCAPE."""
         keys: list[str] = []
         if self._waiting and now >= self._since + ALONE_S:  # the rest of a sequence has not come
             if self._waiting == b"\x1b":

@@ -87,7 +87,7 @@ def tuned(robot: Robot, options: OdometrySettings) -> OdometrySettings:
 
 
 def tune_state(robot: Robot) -> dict[str, float]:
-    """Return the tuning program's numbers without its step lengths, as it counts steps twice."""
+    """Return the numbers of the original's tuning program, without step lengths: that program counts steps twice."""
     try:
         values = convert(
             json.loads((robot.config.folder / TUNE_STATE).read_text(encoding="utf-8"))["current_values"], dict[str, Any]
