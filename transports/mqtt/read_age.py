@@ -58,11 +58,11 @@ class BrokerDelay:
     delay: it is that of the shortest answer of this connection, or TCP's own round trip.
 
     A broker that stood still then reads a packet of each client in turn: it may have answered all our pings before it
-    has read the last old message of another client. So if nothing at all has come since an overdue ping was sent, the
-    messages of the next moment count as having waited as long.
+    has read the last old message of another client. So if nothing at all came for an unusual time after a ping, the
+    messages of the next moment count as having waited for all that time.
 
-    Answers carry no number, and mosquitto drops them where a client's queue is full: later answers then count for
-    pings before theirs. A later PUBACK shows that; so do answers that always come right after the newest ping.
+    Answers carry no number, and mosquitto drops them where a client's queue is full: then later answers are taken
+    for those to earlier pings. A later PUBACK shows that; so do answers that always come right after the newest ping.
     """
 
     def __init__(self) -> None:
@@ -84,7 +84,7 @@ class BrokerDelay:
         self._pings.append(_Ping(now, now, clear))
 
     def stalled(self, since: float, now: float) -> None:
-        """Note that a ping was sent after a time without reading, in which messages may have waited at the broker."""
+        """Note that a ping was sent, and nothing read since ``since``: messages may have waited at the broker."""
         self._pings.append(_Ping(since, now, clear=True))
 
     def answered(self, now: float) -> None:
