@@ -37,7 +37,7 @@ class Counts(NamedTuple):
 
 
 class Legs:
-    """The robot during its calibration. ``expected``: the lengths of its wheels as assumed before.
+    """The robot during its calibration. ``expected``: its track and the steps of its wheels (mm) as assumed before.
 
     ``mm_s`` is its speed at half power. Every leg raises PebbleError if it cannot be driven to its end, or Stopped.
     """

@@ -187,8 +187,9 @@ def rules(
 ) -> tuple[Rule, ...]:
     """Return all rules of this account at a broker.
 
-    ``plain``: bases of robots that do not know account names, or ``+/+/+``. ``at_hub``: return the rules at a Zenoh
-    hub. They differ for a gateway, whose robots are at the hub and their operators at the broker.
+    ``plain``: bases of robots that do not know account names, or ``+/+/+``. ``extra``: metrics beyond the contract.
+    ``at_hub``: return the rules at a Zenoh hub. They differ for a gateway, whose robots are at the hub and their
+    operators at the broker.
     """
     all_rules = [
         *_of_bases(name, account, at_hub=at_hub),

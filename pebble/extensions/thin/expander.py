@@ -45,7 +45,8 @@ class Expander:
     If there are several, the one with the smallest id works. Each decides by the announcements, its own too, that come
     from the broker. All get them in one order with the groups, so no group is taken apart twice. A group that comes
     long after this expander's last announcement has waited, and is dropped. Only streams are published: no state, stop
-    or command of a robot. While two robots claim a short topic, groups there are dropped.
+    or command of a robot. A robot's state ``wire`` may name a short topic for its groups; while two robots name the
+    same, groups there are dropped.
     """
 
     def __init__(self, transport: Transport, clock: Callable[[], float] = time.monotonic, id_: str = "") -> None:
