@@ -16,7 +16,7 @@ _DROPS = {Resolution.KNOWN: Drop.KNOWN, Resolution.HOLD: Drop.HELD}
 
 
 class RetainedTopics:
-    """Retained messages of both sides: they wait for the gate here, and the value that counts is chosen.
+    """Retained messages of both sides: they wait until the `Gate` opens, and the value that counts is chosen.
 
     ``on_value(subject, payload)`` is called with the lock held.
     """
