@@ -34,7 +34,7 @@ class MqttMirror(ForwardingService):
     Where retained messages differ at a reconnect, the local side is right. If a probe of the bridge arrives from the
     broker, that broker is the remote one: the bridge serves it already, and with a second path messages would
     circulate. A probe counts only if the bridge has announced it on the local side. A heartbeat from the broker is a
-    reason to request one.
+    reason to request a probe.
     """
 
     name = "mqtt_mirror"
@@ -152,7 +152,7 @@ class MqttMirror(ForwardingService):
     # -- the transports' threads
 
     def pass_stop(self, side: Side, payload: bytes) -> Iterable[bytes]:
-        """Return the payloads to pass: repetitions for one motor owner stay on the robot's own transport."""
+        """Return the payloads to pass: a stop that the bridge repeats for one motor owner stays on the local side."""
         addressed = side is Side.LOCAL and bool(payload) and codec.decode(ESTOP, payload).owner is not UNSET
         return () if addressed else (payload,)
 

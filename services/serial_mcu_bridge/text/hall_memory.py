@@ -26,7 +26,7 @@ _CHECK_NS = 1_000_000_000  # how soon it is made again, and how often that is tr
 class HallMemory:
     """A ring of ``slots`` samples called ``name``. It is made for the first sample, and stays when its writer ends.
 
-    A reader maps it once, and reads on while its number grows: so a writer continues the ring that it finds.
+    A reader maps it once, and waits for samples with greater numbers: so a writer continues the ring that it finds.
     """
 
     def __init__(self, name: str, slots: int = 2048) -> None:
