@@ -226,7 +226,7 @@ def named(
 
 @contextmanager
 def _in_time() -> Iterator[None]:
-    """Raise PebbleError if importing a stranger's module in the ``with`` block takes too long. Main thread only."""
+    """Raise PebbleError if importing a module of others in the ``with`` block takes too long. Main thread only."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -355,7 +355,7 @@ def motors_of(extensions: Iterable[Extension], config: Any) -> dict[str, str]:
 def programs_of(extensions: Iterable[Extension], config: Any, core: Iterable[str] = ()) -> list[Program]:
     """Return the processes that extensions add to a robot; ``core``: names of Pebble's own processes.
 
-    A process that owns motors is started with the devices. Raises ConfigError if a name is taken.
+    A process that owns motors is put at the stage DEVICE. Raises ConfigError if a name is taken.
     """
     owners = dict.fromkeys(core, "the core")
     programs = []

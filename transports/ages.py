@@ -136,9 +136,9 @@ class SenderClocks(Generic[K]):
 class MessageAges:
     """Ages of messages of other processes; a message older than ``late_s`` is late. Thread-safe.
 
-    All processes of a machine share a clock that counts since its boot. A sender can claim any boot, and so make all
-    messages of that machine seem late: therefore a clock counts for one topic only, on which few may send. A machine
-    whose messages all seem late was suspended for a while, as a virtual machine may be.
+    All processes of a machine share a clock that counts since its boot. A client can pretend to be such a process, and
+    make all real messages seem late: so there is a clock for each topic, and the client spoils only topics on which it
+    may publish. If all messages of a machine seem late for 5 s, it was suspended, as virtual machines can be.
     """
 
     def __init__(self, boot: int, late_s: float) -> None:

@@ -46,7 +46,7 @@ class Outgoing(Struct, frozen=True):
 
     waiting: int = 0  # bytes that the other machine has not confirmed, including some overhead of the protocols
     round_trip_s: float = 0.0  # the shortest of this connection: bytes that wait for less are merely travelling
-    stalled_s: float = 0.0  # how long DELIVERED messages wait and none was acknowledged, beyond two usual round trips
+    stalled_s: float = 0.0  # how long messages of QoS 1 wait and none was acknowledged, beyond two usual round trips
 
 
 class Answer(Struct, frozen=True):
@@ -217,10 +217,10 @@ class TopicPolicy(Struct):
 
     #: True for topics of stops: where a backend refuses messages because too many wait, it still takes these.
     is_stop: Callable[[str], bool] = lambda _topic: False
-    #: True for topics that strangers invent, any number of them: a backend stores nothing for such a topic.
+    #: True for topics whose names clients make up, any number of them: a backend stores nothing for such a topic.
     is_invented: Callable[[str], bool] = lambda _topic: False
-    #: True for topics (UTF-8) whose retained messages are discarded before anything else is done with them: strangers
-    #: plant 100,000. Called with locks held: it must neither wait nor publish. A backend may ignore it.
+    #: True for topics (UTF-8) whose retained messages are discarded before anything else is done with them: a client
+    #: may leave 100,000. Called with locks held: it must neither wait nor publish. A backend may ignore it.
     skips_retained: Callable[[bytes], bool] = lambda _topic: False
     #: Deliver a retained message also after a live one of its topic (T8): the live one may have been our own. The owner
     #: then decides which of them counts.
@@ -360,10 +360,10 @@ class Transport(ABC):
         A live message is refused while there is no connection, and never delivered late. In CONNECTING a peer of Zenoh
         is still connected to other processes: only the hub is away. A retained message is accepted unless the transport
         is closed: the newest value of each topic is stored, for at most 10,000 topics and 16 MB, and sent when the
-        connection is back (T4). ``remember`` False: it is not stored here, because others change it as well; without a
-        connection it is refused. ``shared``: others change it as well, so after an outage a different value there
-        counts as newer than ours, and stays (T9). ``urgent`` gives commands and flags priority where the backend can.
-        Raises TransportError for a topic that is not allowed.
+        connection is back (T4). Two options are for topics that other clients change as well. ``remember`` False: it is
+        not stored here; without a connection it is refused. ``shared``: if the other end has a different value after an
+        outage, that counts as newer than ours, and stays (T9). ``urgent`` gives commands and flags priority where the
+        backend can. Raises TransportError for a topic that is not allowed.
         """
         check_topic(topic)
         if not isinstance(payload, bytes):

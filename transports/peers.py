@@ -167,7 +167,7 @@ class PeerRegistry:
         return [self._run_dir / f"{name}.sock" for name in self._running() if name != but]
 
     def ready(self, *, but: str = "") -> dict[str, str]:
-        """Return the owners of all reachable processes by their names, except the one called ``but``."""
+        """Return the ``owner`` of each reachable process (see `register`), by its name; not of the process ``but``."""
         return {name: owner for name, owner in self._running().items() if owner and name != but}
 
     def _running(self) -> dict[str, str]:

@@ -21,7 +21,7 @@ _CR = const(13)
 
 
 class Port:
-    """``read`` returns bytes; ``send``, called often, sends the ring of ``out``. Ctrl-C is an ordinary byte."""
+    """``read`` returns bytes; ``send``, called often, sends those queued in ``out``. Ctrl-C is an ordinary byte."""
 
     def __init__(self, out) -> None:
         kbd_intr(-1)

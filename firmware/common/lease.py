@@ -10,7 +10,7 @@ class Lease:
     """A lease. Pass requests to ``hold`` and ``release``, drive commands to ``refuses``; call ``tick`` regularly.
 
     A holder drives until 5 s after it got control or last moved something; after that a request gets control at once.
-    ``others``: True for 2 s after a command without a key.
+    ``others``: True if a command without a key has passed here in the last 2 s.
     """
 
     def __init__(self, now: int, diff, random, strangers: int) -> None:
@@ -87,7 +87,7 @@ class Lease:
         return False
 
     def tick(self, now: int) -> None:
-        """End control and requests whose time is over; once the holder rests, pass control on to a client that asks.
+        """End control and requests whose time is over; pass control on to a client that asks once the holder rests.
 
         Call it at least every few minutes, as clocks of boards wrap.
         """

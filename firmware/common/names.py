@@ -26,7 +26,7 @@ def sender(data: memoryview, at: int, stop: int) -> tuple[str, int]:
 
 
 def sign(body: object, by: str) -> None:
-    """Write the account ``by`` into a command, before a person named in it: ``page-1/ann``; "-" (a stranger): alone."""
+    """Write the account ``by`` into a command and, unless it is "-" (none), the person named there: ``page-1/ann``."""
     command = fields(body)
     person = command.get("by")
     command["by"] = shown(by + "/" + person, 40) if isinstance(person, str) and person and by != "-" else by

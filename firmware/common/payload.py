@@ -15,7 +15,7 @@ def load(raw: memoryview | bytes):
     """Return parsed JSON of limited size and depth. Raises ValueError, OverflowError or MemoryError.
 
     Around it may be what programs add: a byte order mark, white space, a C string's NUL and the rest of its buffer.
-    Both ends are cut up to printable ASCII, which JSON begins and ends with, or a byte that no UTF-8 has (from 0xF5).
+    At both ends bytes are cut off until one is printable ASCII, as JSON's ends are, or from 0xF5 on, which is no UTF-8.
     """
     size = len(raw)
     if size > _MAX_BYTES:

@@ -9,7 +9,7 @@ _BUFFER = const(64)
 
 
 class Port:
-    """``read`` returns bytes; ``send`` sends the ring of ``out`` and must be called often."""
+    """``read`` returns bytes; ``send`` sends those queued in ``out``, and must be called often."""
 
     def __init__(self, out) -> None:
         self._out = out

@@ -15,7 +15,7 @@ if not hasattr(sys.stdin, "buffer"):
 
 
 class Port:
-    """``read`` returns bytes; ``send``, called often, sends the ring of ``out``. Ctrl-C is an ordinary byte."""
+    """``read`` returns bytes; ``send``, called often, sends those queued in ``out``. Ctrl-C is an ordinary byte."""
 
     chunk = 1
 

@@ -38,7 +38,7 @@ class NetworkRobot:
         """Store the arguments. ``wrap`` wraps a socket in TLS; None: no TLS.
 
         ``body`` has ``drive(x, z, y)``, True if anything moves; ``stop()``; ``report(publish)``; ``refresh()``. It has
-        ``axes`` if it has the auxiliary one (see `describe`), and ``groups`` if its board has room for groups of
+        ``axes`` if it has more than x and z (see `describe`), and ``groups`` if its board has room for groups of
         commands. ``charging``: whether it reports a charging status, in JSON.
         """
         now = time.ticks_ms()

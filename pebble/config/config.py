@@ -249,7 +249,7 @@ def _classes(installed: tuple[Extension, ...]) -> tuple[type[Root], Any, tuple[R
 
 
 def _guarded(owner: Extension, rule: Check) -> Check:
-    """Return a rule of an extension, with its exceptions turned into problems of the config; ours are not wrapped."""
+    """Return a rule whose exceptions become problems of the config; a rule of our own extensions stays as it is."""
     if owner in extensions.ours():
         return rule
 

@@ -22,12 +22,13 @@ def switch(raw: Any) -> bool | None:
 
 
 def reading_of(annotation: Any, kind: Any, metas: list[Meta], raw: Any, default: Any) -> Reading | None:
-    """Return the value to use for ``raw``, which this key does not accept; None if it is a mistake.
+    """Return the value to use in place of ``raw``, which is not valid for this key; None if there is none to use.
 
     ``kind`` and ``metas`` are the parts of ``annotation``; ``default`` is that of the key, perhaps NODEFAULT. An empty
-    value, 0 or a mere true means the default, and numbers are brought within their limits. The ``extra`` of ``metas``
-    may say otherwise. ``exact``: only 0 means the default, and no number is changed. ``synonyms``: other names of
-    values. ``circle``: the number at which a count starts again at 0. ``unlike``: the value for any mistake.
+    value, 0 or a mere true means the default, and numbers are brought within their limits; a text is a mistake where
+    no number is wanted. Entries in the ``extra`` of ``metas`` change that: ``exact`` (only 0 means the default, and no
+    number is changed), ``synonyms`` (other names of values), ``circle`` (the number at which a count starts again at
+    0), ``unlike`` (the value for any other ``raw``).
     """
     extra = {key: value for meta in metas for key, value in (meta.extra or {}).items()}
     number = _number(raw)
@@ -40,6 +41,8 @@ def reading_of(annotation: Any, kind: Any, metas: list[Meta], raw: Any, default:
             return Reading(value, differs=False)
     if "unlike" in extra:
         return Reading(extra["unlike"])
+    if raw and isinstance(raw, str) and kind not in (int, float):
+        return None
     is_empty = not raw or (raw is True and kind not in (int, float))
     means_default = number == 0 or (is_empty and "exact" not in extra)
     if means_default and default is not NODEFAULT:
@@ -59,7 +62,8 @@ def reading_of(annotation: Any, kind: Any, metas: list[Meta], raw: Any, default:
 def _forms(kind: Any, extra: dict[str, Any], raw: Any, number: float | None) -> list[Any]:
     """Return the forms of ``raw`` to try for ``kind``; ``number``: its value, if any; ``extra``: see `reading_of`."""
     if kind is bool:
-        return [switch(raw)]
+        state = switch(raw)
+        return [] if state is None else [state]
     forms = [raw] if isinstance(raw, str | int | float) else []  # msgspec itself reads numbers in texts
     if isinstance(raw, int) and number is not None and (kind is str or get_origin(kind) is Literal):
         forms.append(str(raw))

@@ -69,7 +69,7 @@ class Reader:
             field = keys.get(key)
             if field is None or value in ("", None):
                 continue
-            if self._other_forms and value == [] and field.default:  # the original means the default by it
+            if self._other_forms and value == [] and isinstance(field.default, tuple):  # for the original: unset
                 continue
             default = field.default if field.default_factory is NODEFAULT else field.default_factory()
             result = self._value(field.type, value, (*path, written), default)
@@ -185,10 +185,13 @@ class Reader:
         import shlex  # few files write a list as one line
 
         try:
-            return shlex.split(line)
+            words = shlex.split(line)
         except ValueError as error:
             self.notes.problem(path, f"cannot be split into words: {error}; write a list of words")
             return []
+        if not words:
+            self.notes.problem(path, "holds no word: write a list of words, or leave the key out")
+        return words
 
     def _map(self, name: Any, item: Any, raw: dict[str, Any], path: problems.Path) -> Any:
         items = {key: self._value(item, value, (*path, key)) for key, value in raw.items()}

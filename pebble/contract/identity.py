@@ -9,7 +9,7 @@ from unicodedata import normalize
 
 from msgspec import Struct
 
-from pebble.errors import ConfigError
+from pebble.errors import ConfigError, PebbleError
 
 # ``/ + # $`` belong to MQTT; brokers close the connection on control characters and Unicode non-characters.
 _RESERVED = r"/+#$\x00-\x1f\x7f-\x9f\ufdd0-\ufdef\ufffe\uffff"
@@ -94,19 +94,21 @@ def composed(name: str) -> str:
 
 
 def untypeable(name: str) -> str:
-    """Return why people cannot type this name, and what to write instead, to follow the name; "" if they can."""
+    """Return the words after a name that say why people cannot type it, and what to write instead; "" if they can."""
     if name in (".", ".."):
         return "is a folder, and no name: write another"
     return "" if composed(name) == name else f"has a letter that no keyboard writes: write {json.dumps(composed(name))}"
 
 
 def meant(names: Iterable[str], typed: str) -> str:
-    """Return the name in ``names`` that looks like ``typed`` on the screen; ``typed`` if it is there, or none does."""
+    """Return ``typed``, or if it is no name, the one in ``names`` that looks like it. PebbleError if several do."""
     if typed.isascii():
         return typed
     alike = [name for name in names if composed(name) == composed(typed)]
     if typed in alike or not alike:
         return typed
+    if len(alike) > 1:
+        raise PebbleError(f"{len(alike)} names look like this: rename all but one")
     return alike[0]
 
 

@@ -1,7 +1,7 @@
 """The sender's account in a topic: ``incoming/by/{account}/{metric}``, where only that account can publish.
 
-A robot whose capabilities have ``named`` reads such topics. Without a name it takes only stops, zeros, and the commands
-that its config allows to strangers. Retained messages are ignored there. A stop with an invalid name has none.
+A robot whose capabilities have ``named`` reads such topics, but no retained messages there. Elsewhere it takes only
+stops, zeros, and what its config allows to strangers. A stop with an invalid account counts as one without account.
 """
 
 import re

@@ -1,9 +1,9 @@
 """Detects messages that circulate: we forward them, and something else brings them back. Pure.
 
 A broker's own bridge, or a second robot with this id, may forward the same topics. A probe that we publish on one side
-and receive on the other proves it for its topic. It must travel on that topic, because the other way may carry no
-other. Its payload is white space that encodes a random number, which no parser of commands accepts. On topics other
-than commands it follows the topic's value, which white space does not change.
+and receive on the other proves it for its topic. It is sent on that very topic, because what brings messages back may
+carry no other. Its payload is white space that encodes a random number, which no parser of commands accepts. On topics
+other than commands it follows the topic's value, which white space does not change.
 """
 
 import logging
@@ -36,7 +36,7 @@ SUSPICIOUS, _WINDOW_S = 5, 2.0
 #: No operator and no script repeats a payload so often in this time.
 STORM = 150
 PROBE_PERIOD_S, _PERIOD_IN_STORM_S = 1.0, 0.1  # between two probes of a topic
-UNANSWERED = 3  # probes, after which the other way is gone
+UNANSWERED = 3  # probes, after which nothing brings messages back any more
 #: A stop is published again after 0.5 s at the earliest; one that comes back is faster.
 _STOP_PERIOD_S = 0.25
 

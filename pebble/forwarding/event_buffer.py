@@ -57,7 +57,7 @@ class EventBuffer:
                 self._counters.add("events_dropped")
 
     def resume(self) -> None:
-        """Send the waiting events, in order, unless a new connection has to be flushed first."""
+        """Send the waiting events, in order; on a new connection after a loss only :meth:`flush` sends them."""
         with self._lock:
             if self._lost_at is None or self._transport.state is not State.CONNECTED:
                 self._drain()  # Zenoh accepts messages while the hub is away

@@ -403,4 +403,4 @@ def barrier(transport: Transport, filter_: str) -> None:
 
 
 def _ignore(_message: Message) -> None:
-    """Do nothing: a barrier has to subscribe to something."""
+    """Do nothing: :func:`barrier` subscribes only to wait for the acknowledgement."""

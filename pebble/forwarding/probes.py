@@ -1,8 +1,8 @@
 """Detects that two of a robot's connections lead to one broker: a probe sent on one arrives on the other. Pure.
 
 The bridge publishes probes on its remote side, and announces each to the mirror on the robot's own transport, where
-clients of the mirrored broker can neither read nor publish. A probe that the mirror receives from both is therefore the
-bridge's; anything else on that topic is not.
+clients of the mirrored broker can neither read nor publish. A probe that comes from that broker is therefore the
+bridge's if the bridge has announced it; anything else on that topic is not.
 """
 
 import secrets

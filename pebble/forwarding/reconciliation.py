@@ -2,8 +2,8 @@
 
 A live message always counts, whichever side publishes it. `resolve` has the rules for the retained messages that a
 subscription brings. At a reconnect the *winner* side is right; the *loser* side only adds topics that the winner lacks.
-A side that has lost a value, or was restored from an earlier save, receives the newest value again. Silence does not
-mean that a side has no value: the winner's value may arrive after the loser's was sent to it.
+A side that has lost a value, or *went back* (was restored from an earlier save), receives the newest value again.
+Silence does not mean that a side has no value: the winner's value may arrive after the loser's was sent to it.
 """
 
 from __future__ import annotations
@@ -202,5 +202,5 @@ class Reconciliation:
         return self._synchronized[self._winner] and topic not in self._received[self._winner]
 
     def _is_missing(self, side: Side, topic: str, last: LastValue) -> bool:
-        """True if ``side`` lacks the newest value. A removal is lacking only where we have published a value."""
+        """True if ``side`` lacks the newest value; a removal only if a value was forwarded to ``side`` before."""
         return topic not in self._received[side] and self._published[side].get(topic, b"") != last.payload

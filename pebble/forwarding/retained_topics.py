@@ -16,7 +16,7 @@ _DROPS = {Resolution.KNOWN: Drop.KNOWN, Resolution.HOLD: Drop.HELD}
 
 
 class RetainedTopics:
-    """Retained messages of both sides: they wait until the `Gate` opens, and the value that counts is chosen.
+    """Retained messages of both sides. They wait here for the :class:`Gate`; then the value that counts is chosen.
 
     ``on_value(subject, payload)`` is called with the lock held.
     """
@@ -39,7 +39,7 @@ class RetainedTopics:
     def receive(
         self, source: SideState, subject: Subject, message: Message, forward: Forward, *, only_old: bool = False
     ) -> Forward | Drop:
-        """Forward a message that will be retained, or return why not. ``only_old``: not if it is a live one."""
+        """Forward a message that will be retained, or return why not. ``only_old``: refuse it if it is live."""
         with self._lock:
             self._begin_restarted()
             if subject.kind in self._both_ways:
@@ -118,7 +118,7 @@ class RetainedTopics:
     # -- with the lock held
 
     def _reconcile(self, source: SideState, subject: Subject, message: Message, *, only_old: bool) -> Drop | None:
-        """Return why a two-way message must not pass; None if it may. ``only_old``: a live one must not."""
+        """Return why a two-way message must not pass; None if it may. ``only_old``: refuse a live message."""
         side, topic, payload, transport = source.side, message.topic, message.payload, source.transport
         if message.retain and topic in source.seen and transport.policy.delivers_late and not transport.as_published:
             return Drop.KNOWN  # certainly retained, and came late: it is older than the live one before it

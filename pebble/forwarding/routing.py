@@ -133,7 +133,7 @@ def _qos(subject: Subject, message: Message) -> QoS:
 
 
 def _retain(subject: Subject, message: Message) -> bool:
-    """True if the message is to be retained: as published, if that is known. Flags are retained on both sides."""
+    """True if a message is to be retained: flags always; others as published or, if that is hidden, as the channel."""
     if subject.kind.one_shot:
         return False
     if subject.kind is Kind.FLAG and subject.retain:

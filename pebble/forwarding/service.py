@@ -154,7 +154,7 @@ class ForwardingService(Service, ABC):
         ]
 
     def subscribe_remote(self) -> None:
-        """Subscribe on a new connection, after the transport has sent the robot's changes during the outage.
+        """Subscribe on a new connection, after the transport has sent what the robot changed during the outage.
 
         Because of this order, no retained message of the remote side is older than a change by the robot.
         """

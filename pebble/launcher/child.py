@@ -20,7 +20,7 @@ class Child:
 
     ``output`` (stdout and stderr, in order), ``notes`` (pebble.runtime.notes) and ``exited`` are descriptors to wait
     on; ``exited`` is None where the process has to be polled (pebble.runtime.exits). The caller closes ``stdin``. The
-    constructor forks: the caller must have one thread and no sessions. Raises OSError.
+    constructor forks: the caller must have one thread and no Zenoh session. Raises OSError.
     """
 
     def __init__(self, program: Program, environment: Mapping[str, str], config: Config, *, stdin: int) -> None:

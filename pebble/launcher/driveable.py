@@ -47,7 +47,7 @@ class Driveable:
     """The newest notes Mcu, Local and Reach of all programs; ``on_change()`` is called when the judgement may change.
 
     ``lines``: the name of each serial line by its program. ``owners``: the programs that drive motors. ``ways``: the
-    programs through which drive commands reach them; they must receive the messages of the owners.
+    programs through which drive commands reach the owners, and which must receive the owners' messages.
     """
 
     def __init__(

@@ -27,7 +27,7 @@ class Features:
 
     @property
     def found(self) -> frozenset[str]:
-        """Further features that at least one process has."""
+        """Features beyond the expected ones, that at least one process has."""
         return self._reported - _EXPECTED
 
     def receive(self, program: str, note: Feature) -> None:

@@ -168,7 +168,7 @@ class Launcher:
             log.error("%s", error)
 
     def _stop(self) -> None:
-        """Stop stage by stage. Each stage has its share of the timeout; a process that hangs is killed at its end."""
+        """Stop stage by stage. A process that still runs after its stage's share of the timeout is killed."""
         log.info("stopping")
         self._status.stopping()
         end = self._reactor.now() + self._config.services.launcher.shutdown_timeout_seconds

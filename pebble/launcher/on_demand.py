@@ -1,4 +1,4 @@
-"""Programs that run only while another program requests them."""
+"""Programs that run only while another program requests them by notes to the launcher (pebble.runtime.notes)."""
 
 import logging
 from collections.abc import Iterable
@@ -17,7 +17,7 @@ log = logging.getLogger(__name__)
 
 
 class OnDemand:
-    """The requests in notes Wanted and Held: a program runs while it is wanted and not held. For one thread."""
+    """The requests in the notes Wanted and Held: a program runs while it is wanted and not held. For one thread."""
 
     def __init__(self, reactor: Reactor, supervisors: Iterable[ProcessSupervisor]) -> None:
         self._reactor = reactor
@@ -52,13 +52,13 @@ class OnDemand:
         self._follow(name)
 
     def hold(self, sender: Program, note: Held) -> None:
-        """Let a program wait, or end the wait, as ``note`` says."""
+        """End a program for a while, or let it run again if it is still wanted, as ``note`` says."""
         if self._may(sender, note):
             self._held[note.program] = note.on
             self._follow(note.program)
 
     def _follow(self, name: str) -> None:
-        """Run the program, let it wait or end it, as the requests now say."""
+        """Run the program, or end it for good or for a while, as the requests now say."""
         supervisor = self._supervisors[name]
         if not self._wanted.get(name):
             supervisor.release()

@@ -1,4 +1,4 @@
-"""The robot's status, capabilities and logs, published through the announcer, and reports to systemd."""
+"""The robot's status, capabilities and logs, published by the process .announcer, and reports to systemd."""
 
 import logging
 import time

@@ -201,7 +201,7 @@ class MotorGuard:
         return EstopState(**fields, barred=self._barred or UNSET)
 
     def _reason_of_refusal(self, moves: bool, is_stranger: bool, now: float) -> str:
-        """Return the counter of a refused drive command; ``is_stranger``: its sender does not have control."""
+        """Return the reason of a refusal, as a counter's name; ``is_stranger``: the sender does not have control."""
         if moves and self._control.waits(now):
             return "handover"
         if is_stranger:

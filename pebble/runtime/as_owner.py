@@ -1,4 +1,4 @@
-"""Lets root work in other users' folders with the rights of the owner, so a link there reaches nothing more."""
+"""Lets root work in another user's folder with that user's rights only: a link there leads to nothing beyond them."""
 
 from __future__ import annotations
 

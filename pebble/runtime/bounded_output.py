@@ -95,7 +95,7 @@ class BoundedOutput:
             self._kept.append(line)
 
     def _say(self) -> None:
-        """Write how many lines were left out, and then the newest of them, which were kept."""
+        """Write how many lines are dropped, and then the newest lines, which have waited."""
         self._say_repeats()
         if missing := self._left_out - len(self._kept):
             self._log("WARNING", f"{missing} lines are left out: {self._rate:g} a second are logged")

@@ -28,7 +28,7 @@ class Wanted(Struct, frozen=True, tag_field="note", tag="wanted"):
 
 
 class Held(Struct, frozen=True, tag_field="note", tag="held"):
-    """A request to let an on-demand program wait, or to end the wait."""
+    """A request to end an on-demand program for a while (``on``), or to let it run again if it is still wanted."""
 
     program: _Name
     on: bool

@@ -100,7 +100,7 @@ class RateController:
 class LevelControl:
     """The choice of a step. It begins with the last step, because the connection is not known yet.
 
-    Quality rises while packets do not wait, later after each rise that failed, and falls while they wait.
+    Quality falls while packets wait, and rises once none has waited for a time, which grows with each rise that failed.
     """
 
     def __init__(self, last: int, now: float) -> None:

@@ -128,7 +128,11 @@ class Catalogue:
         if len(name) > _LONGEST_NAME or not name.isprintable() or "]" in name:
             self._complain(name[:_LONGEST_NAME], "%r is not offered: rename its folder", name)
             return False
-        return self._section_of(name).enabled
+        try:
+            return self._section_of(name).enabled
+        except PebbleError as error:
+            self._complain(name, "%s is not offered: in services.autonomy_manager.scripts %s", name, error)
+            return False
 
     def _section_of(self, name: str) -> ScriptSection:
         sections = self._section.scripts

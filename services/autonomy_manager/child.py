@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 
 
 class Launch(Struct, frozen=True):
-    """The parameters of a process. ``file`` names it in the log; it gets the signal ``tie`` if this one dies."""
+    """The parameters of a process. ``file`` names it in the log; it gets the signal ``tie`` if its parent dies."""
 
     file: str
     command: tuple[str, ...]

@@ -17,14 +17,14 @@ from pebble.services.autonomy_manager.script import Dependency
 
 MANIFEST = "script.json"
 _LIMIT_S = 20.0
-_LONGEST = 256 * 1024  # bytes of an answer or a manifest
+_LONGEST = 256 * 1024  # bytes of an answer or a `script.json`
 _LONGEST_SOURCE = 1024 * 1024
 _REASON_BYTES = 2000  # of what a failing script wrote
 _NICE = "10"  # lower than the robot's own processes
 
 
 class Description(Struct, frozen=True):
-    """A script's description of itself; ``command`` only in a manifest.
+    """A script's description of itself; ``command`` only in a `script.json`.
 
     ``summary`` says in one sentence what it does; ``main`` are the keys of the settings that operators see first.
     ``drives`` is False for a script that only measures; that counts only in an answer to ``--describe``, because
@@ -148,7 +148,7 @@ def _content(file: IO[bytes]) -> bytes:
 
 
 def _parse(raw: bytes, source: str) -> Description:
-    """Return the description in a manifest, or in the last line of an output: modules may print lines before it."""
+    """Return the description in a `script.json`, or in an output's last line: modules may print lines before it."""
     if len(raw) > _LONGEST:
         raise DescribeError(f"{source} is longer than {_LONGEST} bytes")
     try:

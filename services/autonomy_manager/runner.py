@@ -82,7 +82,7 @@ class Runner:
 
     @property
     def stoppable(self) -> Run | None:
-        """The run that a stop must end, or whose successor it must cancel; None if none may move the robot."""
+        """The run to end at a stop, or the ending run whose successor to cancel; None if neither may move the robot."""
         if not self.drives:
             return None
         return self.active if self._next is None else self._run

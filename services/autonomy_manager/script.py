@@ -45,7 +45,7 @@ class Script(Struct, frozen=True, kw_only=True):
     ours: bool = False  # it uses pebble.script, which signs its drive commands and stops the wheels at its end
     broken: str = ""  # why it cannot be started
     asked: bool = True  # False: its settings and what it needs are not known yet
-    own_program: bool = False  # its manifest names what runs it
+    own_program: bool = False  # its `script.json` names what runs it
     drives: bool = True  # it may move the robot, so an emergency stop ends it
 
 
@@ -71,9 +71,7 @@ class Plan(Struct, frozen=True):
 
 def plan(scripts: Mapping[str, Script], file: str, config: Mapping[str, Any]) -> Plan:
     """Return the plan for a start, after checking it. Raises StartError."""
-    script = scripts.get(meant(scripts, file))
-    if script is None:
-        raise UnknownScriptError(f"Unknown autonomy file: {shown(file)}")
+    script = _named(scripts, file, f"Unknown autonomy file: {shown(file)}")
     _check(script, f"Failed to start {script.label}")
     step, values = _step(script, config, f"Invalid config for {script.label}")
     needed = tuple(_dependency(scripts, script.label, dependency) for dependency in script.dependencies)
@@ -82,11 +80,20 @@ def plan(scripts: Mapping[str, Script], file: str, config: Mapping[str, Any]) ->
 
 def _dependency(scripts: Mapping[str, Script], label: str, dependency: Dependency) -> Step:
     failed = f"Failed to start {label}"
-    script = scripts.get(meant(scripts, dependency.file))
-    if script is None:
-        raise UnknownScriptError(f"{failed}: Dependency script not found: {shown(dependency.file)}")
+    script = _named(scripts, dependency.file, f"{failed}: Dependency script not found: {shown(dependency.file)}")
     _check(script, f"{failed}: {dependency.file}")
     return _step(script, dependency.config, f"{failed}: Invalid config for {dependency.file}")[0]
+
+
+def _named(scripts: Mapping[str, Script], file: str, unknown: str) -> Script:
+    """Return the script that ``file`` means. Raises StartError with the text ``unknown``."""
+    try:
+        script = scripts.get(meant(scripts, file))
+    except PebbleError as error:
+        raise StartError(f"{unknown}: {error}") from None
+    if script is None:
+        raise UnknownScriptError(unknown)
+    return script
 
 
 def _check(script: Script, failed: str) -> None:

@@ -214,7 +214,7 @@ class LevelControl:
         return max(busy, 1.0 + lost_share)  # all its time was used, and the lost turns would have needed more
 
     def _go_down(self, load: float, now: float) -> bool:
-        """Reduce as far as necessary. A step up that was just tried is undone, and tried later next time."""
+        """Reduce as far as necessary. A step up that was just tried is undone; the next one has to wait longer."""
         lower = range(self.level + 1, len(STEPS))
         affordable = self.step.cost * _AIM / load
         if self._rose_at is not None and now - self._rose_at < _PROBATION_S:

@@ -1,7 +1,7 @@
 """Repeats a stop to every motor owner until that owner has confirmed it. Kept in memory only; no I/O.
 
 A stop that is sent once must not be lost because an owner restarts or is suspended. For each owner the newest stop
-waits, and is repeated, until a state of that owner names it. No limit on what is remembered here drops a stop.
+waits, and is repeated, until a state of that owner names it. A stop whose name was forgotten for room counts as new.
 """
 
 import secrets
@@ -42,7 +42,7 @@ def named(payload: bytes) -> bytes:
 
 
 class Pending(Struct, frozen=True):
-    """A stop that an owner has not confirmed. ``first``: when it was first forwarded; ``at``: when this wait began."""
+    """A stop that an owner has not confirmed. ``first``: when it was first forwarded; ``at``: since when it waits."""
 
     stop: EstopCommand
     first: float

@@ -252,7 +252,7 @@ class MqttBridge(ForwardingService):
         self.remote.ask(self.subjects.flags)
 
     def _check_brokers(self) -> None:
-        """Open the gate if the two sides cannot be one broker; otherwise begin a round of probing."""
+        """Open the forwarder's gate if the two sides cannot be one broker; otherwise begin a round of probing."""
         if not self._same_broker.possible:
             if self._same_broker.announces:
                 self._same_broker.send()  # before anything is forwarded: the mirror may have to shut
@@ -265,7 +265,7 @@ class MqttBridge(ForwardingService):
             self.call_at(self.clock() + wait_s, partial(self._end_round, round_))
 
     def _end_round(self, round_: int) -> None:
-        """Open the gate if no probe came back. If a connection was lost, another round begins."""
+        """Open the forwarder's gate if no probe came back. If a connection was lost, another round begins."""
         if self._same_broker.proves_two_brokers(round_):
             self._open()
 

@@ -37,7 +37,7 @@ class Vouching:
         return ControlVouched(begin=round(1000 * self._begin), end=round(1000 * self._end))
 
     def _delivered_s(self) -> float | None:
-        """Return the age in seconds beyond which every message has been delivered; None if the broker is late."""
+        """Return an age in seconds: every message that is older has been delivered. None if the broker is late."""
         if self._noticed_s is not None:
             return self._noticed_s
         answer = self._remote.answer

@@ -18,8 +18,8 @@ LOCAL, PERSON = "a script of its own runs", "a person drives it"
 class Visit:
     """The run of another robot here. ``publish`` drives this robot. For one thread; times are of one clock.
 
-    ``begin(robot, run)`` returns why a run cannot begin. ``number(barred, received)`` returns its number here, newer
-    than these two; None while a script of this robot runs. ``local_runs()`` is True while such a script runs.
+    ``begin(robot, run)`` returns why that run cannot begin here. ``number(barred, received)`` returns its number here,
+    newer than both arguments; None while a script of this robot runs. ``local_runs()`` returns True while one runs.
     """
 
     def __init__(

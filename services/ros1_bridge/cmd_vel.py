@@ -30,8 +30,8 @@ _END_S = 1.0  # longest wait for the thread at the end
 class CmdVel:
     """The publisher of commands to the base, and of its lock. Its methods may be called on any thread.
 
-    ``save(owed)`` stores whether this program has locked the base, and still has to unlock it; ``owed`` is the value
-    that an earlier process stored. A lock that this program has not set stays locked.
+    Unlocking is *owed* while this program has locked the base: ``save`` stores whether it is, and ``owed`` is what an
+    earlier process has stored. A lock that this program has not set stays locked.
     """
 
     def __init__(

@@ -10,6 +10,7 @@ from pathlib import Path
 from msgspec import Struct
 
 from pebble.config.visible import is_text
+from pebble.contract.identity import meant
 from pebble.extensions.media import pyav
 
 _WAV = ".wav"
@@ -46,8 +47,7 @@ class Clips:
         """
         self.problem = ""
         root = self._folder.resolve()
-        paths = filter(self._is_clip, islice(self._files(root), _MOST))
-        names = (path[len(str(root)) :].lstrip("/") for path in paths)
+        names = (path[len(str(root)) :].lstrip("/") for path in self._paths())
         clips = sorted(filter(self._can_be_named, names), key=lambda name: (name.lower(), name))
         sizes = accumulate(len(name.encode()) for name in clips)  # of the list up to each clip
         listed = len([size for size in sizes if size <= _LONGEST_LIST])
@@ -56,20 +56,39 @@ class Clips:
         return clips[:listed]
 
     def find(self, name: str) -> Clip | None:
-        """Return the clip that a command names; None if there is none.
+        """Return the clip that a command names; None if there is none. Raises PebbleError if the name fits several.
 
-        The name is relative to the folder, or absolute inside it.
+        The name is relative to the folder, or absolute inside it. An é in it may be one character or two.
         """
-        root = self._folder.resolve()
+        path = self._path(name)
+        clip = self._clip(path, name)
+        if clip is None and path is not None and not name.isascii():
+            clip = self._clip(self._path(meant(self._paths(), str(path))), name)
+        return clip
+
+    def _path(self, name: str) -> Path | None:
+        """Return the path that a name means, with links resolved; None if it means none."""
         try:
-            path = (root / _expanded(name.replace("\\", "/"))).resolve()
-            is_clip = path.is_relative_to(root) and path.suffix.lower() in self._endings and path.is_file()
-        except (OSError, RuntimeError, ValueError):  # too long, links in a circle, no text of a path
+            return (self._folder.resolve() / _expanded(name.replace("\\", "/"))).resolve()
+        except (OSError, RuntimeError, ValueError):  # links in a circle, no text of a path
             return None
-        if not is_clip:
+
+    def _clip(self, path: Path | None, name: str) -> Clip | None:
+        """Return the clip at this path in the folder, or None. ``name`` replaces a name that is no text."""
+        root = self._folder.resolve()
+        if path is None or not path.is_relative_to(root) or path.suffix.lower() not in self._endings:
+            return None
+        try:
+            if not path.is_file():
+                return None
+        except OSError:  # too long
             return None
         inside = path.relative_to(root).as_posix()
         return Clip(inside if is_text(inside) else name, path)  # else the name of a link to it
+
+    def _paths(self) -> Iterator[str]:
+        """Return the paths of all clips, as the folder has them."""
+        return filter(self._is_clip, islice(self._files(self._folder.resolve()), _MOST))
 
     def _files(self, root: Path) -> Iterator[str]:
         def failed(error: OSError) -> None:
@@ -83,7 +102,7 @@ class Clips:
         if not path.lower().endswith(self._endings):
             return False
         if os.path.islink(path):  # noqa: PTH114 - there may be thousands
-            return self.find(path) is not None
+            return self._clip(self._path(path), path) is not None
         return os.path.isfile(path)  # noqa: PTH113
 
     def _can_be_named(self, name: str) -> bool:

@@ -8,8 +8,8 @@ from msgspec import Struct
 
 from pebble.config.home import in_home
 from pebble.contract import MEDIA_REPORT, SOUNDBOARD_COMMAND, SOUNDBOARD_FILES, SOUNDBOARD_STATUS
-from pebble.contract.identity import meant
 from pebble.contract.payloads import STOP_WORDS, MediaReport, SoundboardCommand, SoundboardFiles, SoundboardStatus
+from pebble.errors import PebbleError
 from pebble.runtime.service import Service, on
 from pebble.services.soundboard_handler.clips import Clip, Clips
 from pebble.services.soundboard_handler.config import SoundboardHandler as SoundboardHandlerSection
@@ -91,11 +91,14 @@ class SoundboardHandler(Service):
         if not name.strip():
             self._error = "Play command missing file"
             return None
-        clip = self._clips.find(name) or self._clips.find(name.strip())
-        if clip is None and not name.isascii():  # an é may be one character or two: find what looks the same
-            clip = self._clips.find(meant(self._clips.scan(), name.strip()))
+        not_found = f"Sound file not found: {name[:_LONGEST_NAME]}"
+        try:
+            clip = next(filter(None, map(self._clips.find, dict.fromkeys((name, name.strip())))), None)
+        except PebbleError as error:
+            self._error = f"{not_found}: {error}"
+            return None
         if clip is None:
-            self._error = f"Sound file not found: {name[:_LONGEST_NAME]}"
+            self._error = not_found
             return None
         repeat = command.repeat  # True: until it is stopped, a number: so often, else once
         return _Request(clip, math.inf if repeat is True else max(1, repeat or 1))

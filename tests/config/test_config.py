@@ -175,6 +175,7 @@ class TestOriginal:
             ("services.serial_mcu_bridge.safety.drive_timeout_seconds", 0, 0.75, "not 0; 0.75 is used"),
             ("services.serial_mcu_bridge.safety.drive_timeout_seconds", "9", 5, 'not the text "9"; 5 is used'),
             ("services.av_daemon.video.rotate_degrees", 45, 0, "not 45; 0 is used"),
+            ("services.launcher.enabled", [], True, "not a list; true is used"),
         ],
     )
     def test_a_form_of_the_original_is_replaced_with_a_warning(
@@ -350,6 +351,15 @@ class TestMistakes:
             ("local_mqtt.tls.insecure", "maybe", "must be true or false, not text"),
             ("security.level", False, 'must be "open", "login" or "named", not false'),
             ("local_mqtt.tls.ca_cert", 5, "must be a path, not 5"),
+            ("services.launcher.logs.topic", "+0", "must be a topic: 1 to 250 characters, no + or #"),
+            ("services.launcher.logs", "+0", 'must be an object {…}, not the text "+0"'),
+            ("services.launcher.enabled", "-0", 'must be true or false, not the text "-0"'),
+            ("robot.system", "+0", "must be a topic level"),
+            ("local_mqtt.protocol", "0", 'must be "3.1.1" or "5", not the text "0"'),
+            ("services.homeassistant.expose", "00", 'must be a list […], not the text "00"'),
+            ("services.ros1_bridge.telemetry.wheel_odometry.retain", "x", "must be true or false, not text"),
+            ("services.soundboard_handler.playback.player_command", " ", "holds no word: write a list of words"),
+            ("local_mqtt.port", [], "must be a whole number from 1 to 65535, not a list"),
             ("local_mqtt.password_file", "~nobody-at-all/x", "names a home folder that"),
             ("local_mqtt.password_file", "a\x00b", "holds U+0000, which is not shown: remove it"),
             ("services.av_daemon.env", {"A\x00B": ""}, 'has a key "A\\u0000B" that holds U+0000'),

@@ -39,7 +39,7 @@ class BridgeMode:
             self._note_bridge(result)
 
     def _note_bridge(self, result: Result) -> None:
-        """Note how a CONNECT in bridge mode has ended. A hang-up counts after a probe, or where one counted before."""
+        """Note the end of a CONNECT in bridge mode. A hang-up counts after a probe, or if it was missing before."""
         probed, self._probed = self._probed, False
         if result is Result.ACCEPTED:
             self._lacking = False

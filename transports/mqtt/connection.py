@@ -34,11 +34,11 @@ from pebble.transports.mqtt.poll import NOTHING, SocketPoll
 
 T = TypeVar("T")
 FILTERS = 8  # in one packet: AWS IoT closes the connection for more
-UNACKED_LIMIT = 1000  # DELIVERED messages the broker has not acknowledged; beyond it they are refused,
+UNACKED_LIMIT = 1000  # messages of QoS 1 that the broker has not acknowledged; beyond it they are refused,
 UNACKED_RESERVE = 100  # except so many stops: the messages before them may be those of strangers
 _OVERHEAD = 1 + 4 + 2 + 2 + 1 + 5  # bytes of a PUBLISH besides topic and payload, at most: with an expiry
 _FRESH_S = 0.05  # what is in a socket that was empty so recently counts as having come just now
-_UNWRITTEN = 1 << 20  # bytes of DELIVERED messages that wait where the broker has no QoS 1; beyond it they are refused
+_UNWRITTEN = 1 << 20  # bytes that wait to be sent where the broker has no QoS 1; beyond it messages are refused
 _UNSENT = 4 * 1024  # bytes in the kernel beyond those on their way, over a thin link
 _UNREACHED: dict[type[Exception], type[Lost]] = {ConnectionRefusedError: Absent, TlsLateError: TlsLate}
 _BY_SYSTEM = 0  # as the system has it
@@ -251,7 +251,7 @@ class Connection:
         return ack
 
     def publish(self, message: Message, *, expires_s: int | None = None) -> bool:
-        """Send a message; False if that is impossible. A LATEST message may wait, and be dropped for a newer one."""
+        """Send a message; False if that is impossible. A message of QoS 0 may wait, and be dropped for a newer one."""
         with self._lock:
             client, limits = self._client, self.limits
             if client.socket is None:
@@ -281,7 +281,7 @@ class Connection:
         return _OVERHEAD + len(message.topic.encode()) + len(message.payload) <= self.max_packet
 
     def _is_full(self, message: Message) -> bool:
-        """True if ``message`` is refused now that UNACKED_LIMIT is reached. A stop is sent while the reserve lasts."""
+        """True if ``message`` is refused now that UNACKED_LIMIT is reached. UNACKED_RESERVE more stops are sent."""
         beyond = self.in_flight.unacked - UNACKED_LIMIT
         return beyond >= UNACKED_RESERVE or not self._owner.policy.is_stop(message.topic)
 

@@ -131,7 +131,7 @@ class Dialler:
             self.limits.note_connect(result, time.monotonic())
 
     def _note_probe(self, result: Result) -> None:
-        """Note how a CONNECT without bridge mode and will has ended."""
+        """Note how a CONNECT without bridge mode and without a will has ended."""
         if self._bridge_mode.next_attempt is Attempt.PROBE:
             self._bridge_mode.note(result)
         if self._will is not None:  # without one nothing was left out
@@ -155,7 +155,7 @@ class Dialler:
         return attempt.in_flight.lost_bytes > _LARGE or (answered_s is not None and answered_s < _SOON_S)
 
     def note_end(self, lost: Lost) -> bool:
-        """Note how a connection, or an attempt, has ended; return True if segments are small from now on."""
+        """Note how a connection, or an attempt, has ended; return True if TCP's segments are made small from now on."""
         silent, late = isinstance(lost, Silent), isinstance(lost, TlsLate)
         if silent:
             self.stalled = True

@@ -39,7 +39,7 @@ _NEVER = 0xFFFFFFFF  # no round trip was measured yet
 
 
 class Backlog:
-    """LATEST messages that wait for a socket which accepts no more, in order (T4).
+    """Messages of QoS 0 that wait for a socket which accepts no more, in order (T4).
 
     When there are too many, a new message replaces the oldest. A retained message is replaced only by a newer one of
     its topic.
@@ -82,7 +82,7 @@ class Backlog:
         return self._remove(next(iter(self.waiting)))
 
     def supersede(self, newer: Message) -> int:
-        """Drop waiting messages on the topic of a DELIVERED message that is sent before them (T8); return how many."""
+        """Drop waiting messages on the topic of ``newer``, which is sent before them (T8); return how many."""
         stale = [
             key
             for key, message in self.waiting.items()
@@ -121,8 +121,8 @@ class _Unconfirmed(Struct):
     """A retained message that the broker may not have, until a PUBACK or the answer to a later ping confirms it."""
 
     message: Message
-    mid: int | None = None  # of a DELIVERED message, once it is written
-    ping: int | None = None  # the number of the next ping after a LATEST message was written
+    mid: int | None = None  # of a message of QoS 1, once it is written
+    ping: int | None = None  # the number of the next ping after a message of QoS 0 was written
 
 
 class _Ping(NamedTuple):
@@ -207,9 +207,9 @@ class InFlightTable:
         return self._unacked[mid][0] if mid in self._unacked else None
 
     def first_written(self, now: float) -> dict[str, int]:
-        """Return the size of the largest recent message of each topic that may be unconfirmed.
+        """Return by topic the size of the largest recent message that may be why the broker hangs up.
 
-        A message is counted only if it is the first of its topic, or larger than all before it.
+        It is larger than all messages of its topic that the broker has accepted, as an answered ping shows.
         """
         sizes: dict[str, int] = {}
         for written in [*(ping.written for ping in self._pings), self._written]:

@@ -57,7 +57,7 @@ class BrokerDelay:
     A ping that itself took long to get there, behind our own data, tells nothing. The usual time of an answer is no
     delay: it is that of the shortest answer of this connection, or TCP's own round trip.
 
-    A broker that stood still then reads a packet of each client in turn: it may have answered all our pings before it
+    A broker that has stood still reads a packet of each client in turn: it may have answered all our pings before it
     has read the last old message of another client. So if nothing at all came for an unusual time after a ping, the
     messages of the next moment count as having waited for all that time.
 
@@ -115,7 +115,7 @@ class BrokerDelay:
         self._delivered = self._read
 
     def delivery(self, now: float) -> tuple[float, float]:
-        """Return the age of the newest ping before which everything is delivered, and how late its answer was."""
+        """Return the age of the newest ping with all messages before its answer delivered, and how late answers are."""
         sent_at, took = self._delivered
         waits = now - self._pings[0].sent_at if self._pings else 0.0
         return now - sent_at, max(took, waits) - self._shortest
@@ -123,12 +123,12 @@ class BrokerDelay:
     def seconds(self, now: float, round_trip_s: Callable[[], float]) -> float:
         """Return how long messages received at ``now`` have waited; ``round_trip_s`` asks for TCP's present round trip.
 
-        | case                                      | it has waited                                         |
-        |-------------------------------------------|-------------------------------------------------------|
-        | the newest ping was answered late         | as long as the answer took                            |
-        | a ping is unanswered                      | since it was sent, or since nothing was read before it |
-        | the broker stood still until a moment ago | as long as it stood still                             |
-        | none of these is longer than usual        | not at all                                            |
+        | case                                      | it has waited                                              |
+        |-------------------------------------------|------------------------------------------------------------|
+        | the newest ping was answered late         | as long as the answer took                                 |
+        | a ping is unanswered                      | since it was sent, or since the pause in reading before it |
+        | the broker stood still until a moment ago | as long as it stood still                                  |
+        | none of these is longer than usual        | not at all                                                 |
 
         The longest counts, less the time of the way itself.
         """

@@ -90,7 +90,7 @@ class Stamp(msgspec.Struct, frozen=True):
     """The origin of a retained message. ``retained_count`` 0: it was sent again, or the hub made it.
 
     The fields are not checked, because a hub is not told from which session a message has come. So a client that may
-    retain on a topic can forge them: a session then skips its message, or a query is answered half a second too early.
+    retain on a topic can forge them: a session then skips that message, or a query is answered half a second too early.
     """
 
     qos: QoS
@@ -173,7 +173,7 @@ def ask(session: zenoh.Session, key: str, payload: bytes, timeout: float) -> byt
 
 
 def account_of(key: str, what: str) -> str:
-    """Return the account in a query's key; empty: this machine. Raises ValueError for what no account may send."""
+    """Return the account in a key of :func:`asked`; "" for a process of this machine. Raises ValueError."""
     account = key.removeprefix(what).removeprefix("/")
     if not key.startswith(what) or "*" in account or "/" in account or OF in account:
         raise ValueError(f"{key} is no query of an account")

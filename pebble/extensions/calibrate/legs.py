@@ -82,7 +82,7 @@ class Legs:
             raise PebbleError("its wheels turn although it rests: end what drives it, and begin again")
 
     def straight(self, name: str, mm: float) -> Counts:
-        """Drive ``mm`` by the counts; negative is backwards. Return the counts."""
+        """Drive ``mm``, measured by the steps of the wheels; negative is backwards. Return the counts."""
 
         def ends(counts: Counts) -> bool:
             left, right = self._way_mm(counts)

@@ -118,7 +118,7 @@ class Observer:
         return 2 * self._slowest_s
 
     def happens(self, condition: Callable[[], object]) -> bool:
-        """True if ``condition`` becomes true within the time in which a breach of a duty would show."""
+        """True if ``condition`` becomes true within :attr:`patience_s`: for what must not happen."""
         return self.wait(condition, self.patience_s)
 
     # -- what is sent

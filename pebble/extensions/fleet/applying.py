@@ -181,7 +181,7 @@ def _reload(folder: Path) -> str:
 
 
 def _handles_signal(pid: int) -> bool:
-    """True if mosquitto handles SIGHUP, now or soon. Just after its start SIGHUP would end it (2.0.11, measured)."""
+    """True if mosquitto handles SIGHUP within _STARTING_S. At first SIGHUP would end it (2.0.11, measured)."""
     deadline = time.monotonic() + _STARTING_S
     while time.monotonic() < deadline:
         status = Path(f"/proc/{pid}/status").read_text(encoding="ascii")

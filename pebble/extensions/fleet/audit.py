@@ -14,6 +14,8 @@ from pebble.extensions.fleet.tries import network_of
 
 #: What anybody can cause, without a right and without a login.
 REFUSED: Final = ("login-refused", "login-limited")
+#: What many pages may ask of many robots at once. Its rows take no room that others need.
+MILD: Final = ("lights", "soundboard")
 OTHERS = "(others)"
 MAX_ROWS, MAX_REFUSED = 100_000, 10_000  # of all, and of REFUSED; beyond, the oldest go
 _TRIM_PERIOD = 1000  # rows between two deletions of old ones
@@ -63,7 +65,7 @@ class Audit:
         texts = {field: text[:_MAX_TEXT].encode(errors="replace").decode() for field, text in fields}
         refused = what in REFUSED
         like = (what, network_of(address)) if refused else None  # one row for a network, whatever names it tries
-        most = OF_STRANGERS if refused else DIFFERENT  # different rows a minute, see RowWriter.add
+        most = OF_STRANGERS if refused or what in MILD else DIFFERENT  # different rows a minute, see RowWriter.add
         self._writer.add({"t": time.time(), "what": what, **texts}, like, most)
 
     def read(self, limit: int, ref: str = "") -> list[Entry]:

@@ -46,7 +46,7 @@ def hashed(password: str) -> Hashed:
 def conf_text(fleet: Fleet, folder: Path, user: str) -> str:
     """Return the text of `mosquitto.conf`. All its paths are absolute.
 
-    It is a whole configuration or, if the mosquitto of its machine includes it, a part without process and persistence.
+    If the machine's own mosquitto includes the text, it is only a part, without user, pid file, log and persistence.
     """
     server = fleet.brokers[0]
     where = f" {server.host}" if is_loopback(server.host) else ""

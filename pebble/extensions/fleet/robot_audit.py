@@ -1,9 +1,10 @@
 """The robot's audit: a log of JSON lines about who did what, which the bridge writes when commands pass.
 
-Forwarding never waits for it. It holds no driving commands, and no parameters or keys of others.
+Forwarding never waits for it. It holds no driving commands, and no parameters or keys of other commands.
 """
 
 import errno
+import math
 import os
 import time
 from collections import deque
@@ -15,11 +16,26 @@ from typing import Any
 import msgspec
 
 from pebble.config import Config
-from pebble.contract import AUTONOMY_COMMAND, CONTROL, CONTROL_TAKE, ESTOP, ESTOP_RESET, Channel, Kind, codec
+from pebble.contract import (
+    AUTONOMY_COMMAND,
+    CONTROL,
+    CONTROL_TAKE,
+    ESTOP,
+    ESTOP_RESET,
+    GROUP,
+    LIGHTS_FLASH,
+    LIGHTS_SOLID,
+    OUTLET_COMMAND,
+    SOUNDBOARD_COMMAND,
+    Channel,
+    Kind,
+    codec,
+    groups,
+)
 from pebble.contract.names import NO_ACCOUNT
-from pebble.contract.payloads import AutonomyCommand, ControlState, EstopCommand
+from pebble.contract.payloads import ControlState, EstopCommand, LightsSolid, Switch
 from pebble.errors import PayloadError
-from pebble.extensions.fleet.row_writer import OF_STRANGERS, Row, RowWriter
+from pebble.extensions.fleet.row_writer import DIFFERENT, OF_STRANGERS, WINDOW_S, Row, RowWriter
 from pebble.forwarding.observer import ROBOT, Observer
 from pebble.forwarding.routing import Drop
 from pebble.motion.lease import shown
@@ -29,7 +45,7 @@ from pebble.version import __version__
 _UNCHECKED = "?"  # behind a name that the broker has not checked
 _MOST_BYTES = 8_000_000  # of each of two files
 _NAME, _FILE = 40, 64  # characters
-_STOPS = 256  # names of stops that are remembered: a stop is repeated until it is confirmed
+_STOPS = 256  # names of stops that are remembered: a stop is repeated until it is confirmed; and senders of lights
 _REFUSED = {
     *(Drop.UNNAMED, Drop.MISNAMED, Drop.UNREADABLE, Drop.SIGNED, Drop.LATE),
     *(Drop.STALE, Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN),
@@ -40,8 +56,13 @@ _COMMANDS: dict[str, Callable[[Any], Row]] = {
     ESTOP_RESET.suffix: lambda _: {"what": "reset"},
     CONTROL.suffix: lambda request: {"what": "control-released", "id": request.id} if request.ends() else {},
     CONTROL_TAKE.suffix: lambda request: {"what": "control-demanded", "id": request.id},
-    AUTONOMY_COMMAND.suffix: lambda request: _script_row(request),
+    AUTONOMY_COMMAND.suffix: lambda request: _file_row("script", request),
+    SOUNDBOARD_COMMAND.suffix: lambda request: _file_row("sound", request),
+    LIGHTS_SOLID.suffix: lambda colour: _lights_row(colour),
+    LIGHTS_FLASH.suffix: lambda colour: _lights_row(colour),
+    OUTLET_COMMAND.suffix: lambda request: {"what": "outlet", "on": request.on},
 }
+_MILD = (SOUNDBOARD_COMMAND, LIGHTS_SOLID, LIGHTS_FLASH)  # their rows take no room that others need
 
 
 def files(config: Config) -> list[Path]:
@@ -56,9 +77,10 @@ class Audit(Observer):
     def __init__(self, config: Config, clock: Callable[[], float] = time.monotonic) -> None:
         self._path, self._older = files(config)
         self._level = config.security.level
-        self._writer = RowWriter(self._append, clock)
+        self._writer, self._clock = RowWriter(self._append, clock), clock
         self._holder: ControlState | None = None  # None: not known yet
         self._stops = deque[tuple[str, str]](maxlen=_STOPS)  # those that have a row: name and sender
+        self._lights = dict[tuple[str, bool], float]()  # when each sender last sent lights, on or off
 
     def start(self) -> None:
         self._writer.start()
@@ -67,12 +89,16 @@ class Audit(Observer):
     def close(self) -> None:
         self._writer.close()
 
-    def note(self, what: str, who: str = ROBOT, **more: str | float | bool) -> None:
-        """Add a row; ``what`` is one of a fixed set."""
-        self._writer.add({"t": round(time.time(), 3), "what": what, "who": who, **more})
+    def note(self, what: str, who: str = ROBOT, *, most: int = DIFFERENT, **more: str | float | bool) -> None:
+        """Add a row; ``what`` is one of a fixed set. ``most``: as of the writer."""
+        self._writer.add({"t": round(time.time(), 3), "what": what, "who": who, **more}, most=most)
 
     def passed(self, channel: Channel, by: str | None, payload: bytes) -> None:
-        """Add a row for a message that passed, without its parameters and keys."""
+        """Add a row for a message that passed, without its parameters and keys; for a group, of each member."""
+        if channel is GROUP:
+            with suppress(PayloadError):
+                for member in groups.decode(payload):
+                    self.passed(member.channel, by, member.payload)
         row_of = _COMMANDS.get(channel.suffix)
         if row_of is None and channel.kind not in (Kind.FLAG, Kind.ACTION):
             return
@@ -80,8 +106,8 @@ class Audit(Observer):
             if row_of is not None:
                 command = codec.decode(channel, payload)
                 row, who = row_of(command), _sender(by, command)
-                if row and not self._noted_before(row.get("stop", ""), who):
-                    self.note(who=who, **_place(by), **row)
+                if row and not self._noted_before(row, who):
+                    self.note(who=who, most=OF_STRANGERS if channel in _MILD else DIFFERENT, **_place(by), **row)
             else:
                 on = bool(payload) and bool(codec.decode(channel, payload))
                 if on or channel.kind is Kind.FLAG:  # an action that is not "on" does nothing
@@ -108,11 +134,20 @@ class Audit(Observer):
     def unconfirmed(self, owner: str, stop: EstopCommand) -> None:
         self.note("stop-not-confirmed", owner=owner, stop=str(stop.stop))
 
-    def _noted_before(self, stop: str, who: str) -> bool:
-        """True if this sender's stop already has a row; else remember the stop.
+    def _noted_before(self, row: Row, who: str) -> bool:
+        """True if this sender's stop already has a row, or lights that go on; else remember it.
 
-        A stop may arrive twice, with an account and without; the two count as different senders.
+        A stop may arrive twice, with an account and without; the two count as different senders. Lights that blink are
+        one row on and one off, until they rest for a minute.
         """
+        if row["what"] == "lights":
+            key, now = (who, row["on"]), self._clock()
+            last_at = self._lights.pop(key, -math.inf)
+            if len(self._lights) >= _STOPS:
+                self._lights.clear()
+            self._lights[key] = now
+            return now - last_at < WINDOW_S
+        stop = row.get("stop", "")
         repeated = (stop, who) in self._stops
         if stop and not repeated:
             self._stops.append((stop, who))
@@ -139,10 +174,14 @@ class Audit(Observer):
             os.close(file)
 
 
-def _script_row(request: AutonomyCommand) -> Row:
+def _file_row(what: str, request: Switch) -> Row:
     if not request.ends() and not request.file:
         return {}
-    return {"what": "script-stop" if request.ends() else "script-start", "file": (request.file or "")[:_FILE]}
+    return {"what": f"{what}-stop" if request.ends() else f"{what}-start", "file": (request.file or "")[:_FILE]}
+
+
+def _lights_row(colour: LightsSolid) -> Row:
+    return {"what": "lights", "on": colour.r + colour.g + colour.b > 0}
 
 
 def _sender(by: str | None, command: Any = None) -> str:
@@ -154,6 +193,6 @@ def _sender(by: str | None, command: Any = None) -> str:
     return f"{name}{_UNCHECKED}" if by is None or by == NO_ACCOUNT else by
 
 
-def _place(by: str | None) -> dict[str, str]:
+def _place(by: str | None) -> Row:
     """Return the field of a row that names the side from which a command came."""
     return {"from": "robot" if by == ROBOT else "operators"}

@@ -265,7 +265,7 @@ def _of_gateway_heartbeats(name: str) -> Iterator[Rule]:
 def _of_neighbour(base: str) -> Iterator[Rule]:
     """Yield the rules of a robot as a neighbour.
 
-    The id in its commands' topics must be its own, so that no other robot can claim it.
+    It may command others only on topics with its own id, so that no other robot can claim to be this one.
     """
     kind, _, name = base.rpartition("/")
     yield Rule("read", f"{kind}/+/{OUTGOING}/#")
@@ -287,7 +287,7 @@ def _of_expander() -> Iterator[Rule]:
 def _of_rights(
     name: str, held: frozenset[Right], level: SecurityLevel, plain: Sequence[str], extra: Extra
 ) -> Iterator[Rule]:
-    """Yield the rules of an account for its rights; ``plain``: as in :func:`rules`."""
+    """Yield the rules of an account for its rights; ``plain`` and ``extra``: as in :func:`rules`."""
     if Right.LOOK in held:
         yield Rule("read", f"{_ANY}/{OUTGOING}/#")
         yield Rule("read", f"{_ANY}/{INCOMING}/flags/#")

@@ -69,7 +69,7 @@ class RowWriter:
         self._wake.set()
 
     def _end_window(self, now: float) -> None:
-        """Begin a new window. Of rows with copies that were only counted, queue the newest with that number."""
+        """Begin a new window. Where similar rows were only counted, queue the newest of them, with their number."""
         for row, count in self._counts.values():
             if count:
                 self._put({**row, "count": count})

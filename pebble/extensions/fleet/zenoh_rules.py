@@ -40,8 +40,8 @@ def zenoh_text(fleet: Fleet) -> bytes:
 def _hub_account(account: Account, held: Iterable[Rule]) -> HubAccount:
     """Return an account's filters for wills and retained messages.
 
-    A robot may retain all that it may publish, and leave a will on its outgoing topics. Others may retain flags
-    without an account's name.
+    A robot may retain all that it may publish, and leave a will on its outgoing topics. Others may retain flags,
+    on topics without an account's name.
     """
     writes = [rule.filter for rule in held if rule.access == "write"]
     is_robot = ProgramRole.ROBOT in account.roles

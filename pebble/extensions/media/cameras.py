@@ -125,7 +125,7 @@ def _run_dir(robot: str | Path, env: Mapping[str, str]) -> Path:
 
 
 def _usual_places(robot: str, env: Mapping[str, str]) -> list[Path]:
-    """Return the usual run directories of a robot: that in this environment, and that of a robot without a login."""
+    """Return the usual run directories of a robot: in this environment, and outside of a login session."""
     levels = robot.split("/")
     if len(levels) not in (1, 3):
         raise ConfigError(f"camera: {robot} is neither a robot's id nor a base topic nor a config file")

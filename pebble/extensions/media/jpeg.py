@@ -61,7 +61,7 @@ def jpeg_size(jpeg: bytes) -> tuple[int, int]:
 
 
 def _check(jpeg: bytes, frame: int, width: int, height: int) -> None:
-    """Raise PayloadError unless the picture is whole and within the limits. ``frame``: the place of its size."""
+    """Raise PayloadError unless the picture is whole and within the limits. ``frame``: offset of its frame header."""
     if not (0 < width <= MAX_EDGE and 0 < height <= MAX_EDGE):
         raise PayloadError(f"JPEG: {width}x{height}, larger than {MAX_EDGE}x{MAX_EDGE} or nothing")
     if jpeg.find(_EOI, frame) < 0:

@@ -126,7 +126,7 @@ def _check(reader: Reader, web: WebInterface, path: Path) -> WebInterface:
 
 
 def _check_tls(reader: Reader, tls: WebTls, path: Path) -> WebTls:
-    """Refuse a certificate without a key or a key without a certificate; warn of files that are missing or readable."""
+    """Refuse a certificate or key without the other. Warn of missing files, and of a key that every user can read."""
     for key, other in (("certificate", "key"), ("key", "certificate")):
         if getattr(tls, key) is not None and getattr(tls, other) is None:
             reader.notes.doubt((*path, other), f"is missing, it belongs to {key}")

@@ -220,8 +220,7 @@ class Control:
             self._refuse(op, "The server cannot reach the broker")
             return
         self._post(m.Done(cmd=_tag(op), ref=op.ref, n=op.n))
-        if not isinstance(op, m.LightsOp | m.SoundboardOp):
-            self._audit(_tag(op), op.ref, detail=_detail(op))
+        self._audit(_tag(op), op.ref, detail=_detail(op))
 
     def _publish(self, op: m.RobotOp, message: Message) -> bool:
         """Publish a command, or keep lights for the next drive command; return False if it was not accepted."""
@@ -418,5 +417,7 @@ def _tag(op: m.FromPage) -> str:
 
 
 def _detail(op: m.RobotOp) -> str:
+    if isinstance(op, m.LightsOp):  # not each colour of a slider
+        return "off" if robot_commands.ends(op) else "on"
     fields = msgspec.to_builtins(op)
     return ", ".join(f"{key} {value}" for key, value in fields.items() if key not in _NOT_NOTED)[:200]

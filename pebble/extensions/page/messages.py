@@ -84,7 +84,7 @@ class DriveOp(_FromPage, frozen=True, kw_only=True, tag="drive"):
 
 
 class StopOp(_FromPage, frozen=True, kw_only=True, tag="stop"):
-    """The space bar: a zero, from everybody, with or without control. It does not latch."""
+    """The space bar: a zero, which every page may send, with or without control. It does not latch."""
 
     ref: Ref
 

@@ -30,13 +30,13 @@ STEP_S = 1.0  # between two changes of what is received of one component: capabi
 
 
 class _Meaning(NamedTuple):
-    """The component and channel of a topic that does not tell them by its own name."""
+    """The component and channel of a topic whose name does not show them: flags, aliases, and renamed topics."""
 
     ref: str
     channel: c.Channel
 
 
-#: Filters to subscribe to; None: the topics below them tell component and channel by their names.
+#: Filters to subscribe to; None: the names of the topics show component and channel.
 _Filters = dict[str, _Meaning | None]
 
 #: Channels for which capabilities may name a topic that is subscribed to, besides overlays and flags.

@@ -107,7 +107,7 @@ def _action_topic(op: m.ActionOp, channel: Channel, capabilities: dict[str, Any]
 
 
 def _sections(op: m.ActionOp) -> list[str]:
-    """Return the names that the section about this action may have; the original page accepts all of them."""
+    """Return the names that capabilities may give the section of this action; the original page accepts all of them."""
     names = (op.name.replace("-", "_"), op.name)
     return [f"system.{name}" for name in names] + list(names)
 

@@ -275,7 +275,7 @@ class Robots:
             self._mark(component.ref, c.ONLINE.metric)
 
     def _add(self, ref: str) -> Component | None:
-        """Add a component; None if the table is full. For a wanted robot the newest one that is not kept is removed."""
+        """Add a component; None if the table is full. If it ``is_wanted``, the newest not ``is_kept`` gives way."""
         if len(self.components) >= MAX_COMPONENTS:
             if not self.omitted:
                 log.warning("more than %d components at this broker: give it accounts", MAX_COMPONENTS)

@@ -209,7 +209,7 @@ class Stops:
 
 
 def _worth(stop: _PressedStop) -> tuple[bool, bool, bool]:
-    """Return a sort key for removal: stops that are over first, then of robots never heard, then of one robot."""
+    """Return a sort key for removal: stops that are over, then of robots never heard, of one robot, of all."""
     is_of_all = stop.ref == ""
     robots = stop.sender.robots.values()
     was_heard = is_of_all or any(robot.live or robot.estop.has_capabilities for robot in robots)
@@ -217,7 +217,7 @@ def _worth(stop: _PressedStop) -> tuple[bool, bool, bool]:
 
 
 def _progress(stop: RobotStop) -> tuple[str, str]:
-    """Return the progress of a robot's stop, and words for people; "" if it is confirmed and saved."""
+    """Return the progress of a robot's stop, and what is missing in words: "" if it is confirmed and saved."""
     progress = stop.progress
     if progress is Progress.CONFIRMED and not stop.saved:
         return progress.value, "stopped, but not saved: after a power cut it is free"

@@ -160,10 +160,10 @@ def _from_clock(wall_clock: Callable[[], float]) -> int:
 
 
 def _above(barred: int, *used: int) -> int:
-    """Return the number after the newest of ``barred`` and ``used``, where 0 stands for none.
+    """Return the number after the newest of ``barred`` and ``used``; 0 stands for no number.
 
-    The numbers go round: one that is half of them ahead of ``barred`` counts as older. So a used number is left out if
-    the number after it would count as older than ``barred``.
+    After the last number comes 1. So a number counts as older than ``barred`` if it is ahead by half of all numbers or
+    more. A used number is left out if the number after it would count as older than ``barred``.
     """
     base = barred or newest(used)
     steps_ahead = [(run - base) & LAST_RUN for run in used if run and newer(following(run), base)]

@@ -76,9 +76,9 @@ class GroupGate:
     """A gate before a forwarder, for messages from outside. Messages that are no groups go on to :attr:`pass_on`.
 
     A group passes if each member would: it is published whole, and then a copy of each member by itself, for programs
-    that know no groups. Motor owners and described boards obey the whole; their copies are marked, and they obey of
-    these only zeros. A group of which a member may not pass is dropped, except for members that only end something.
-    Marked copies from outside are refused: observers would see motion that is not there.
+    that know no groups. Motor owners and described boards obey the whole: copies of the members for them are marked,
+    and of marked copies they obey only zeros. A group of which a member may not pass is dropped, except for members
+    that only end something. Marked copies from outside are refused: observers would see motion that is not there.
     """
 
     def __init__(self, forwarder: Forwarder, addresses: Addresses, note_drive: Callable[[bytes], None]) -> None:

@@ -43,9 +43,9 @@ class Sieve:
 
     ``stream_s``: the least seconds between two messages of a stream. Waiting messages that newer ones replaced are
     counted as ``thinned`` if there was room, else as ``shed``.
-    States go before events, events before streams; within a rank goes first what has waited longest, or small messages
-    would always take the room that a large one needs. So that none waits for ever, after OVERDUE_S a stream counts as
-    a state, and an event goes before the states.
+    States go before events, events before streams. Within a rank the message that has waited longest goes first:
+    otherwise small ones would always take the room that a large one needs. So that none waits for ever, a stream that
+    has waited for OVERDUE_S goes with the states, and an event that has waited so long goes before them.
     """
 
     def __init__(self, takes: Callable[[Rank, int], bool], counters: Counters, clock: Callable[[], float]) -> None:

@@ -78,7 +78,8 @@ class LinkReport:
 class MediaHold:
     """A pause of the programs with pictures or sound while a person drives over the same modem.
 
-    ``request(program, on)`` asks the launcher for it, and returns False if the launcher is busy.
+    ``request(program, on)`` asks the launcher to begin a program's pause, or to end it if ``on`` is False.
+    It returns False if the launcher is busy.
     """
 
     def __init__(self, programs: Collection[str], request: Callable[[str, bool], bool]) -> None:

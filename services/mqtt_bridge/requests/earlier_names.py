@@ -1,4 +1,4 @@
-"""Removes retained messages under the robot's earlier names, before its identity in the config was changed.
+"""Removes retained messages under the names that the robot had before its identity in the config was changed.
 
 Otherwise they would stay, and operators would see a robot that is off for ever.
 """
@@ -152,7 +152,7 @@ class _Removal:
     ) -> None:
         """Subscribe on all sides, and call ``then`` after ``wait_s``. No exception ends the bridge.
 
-        ``note(answers, message)`` adds what a message says to the answers of its side.
+        ``note(answers, message)`` is called with each message and the set of answers of its side, to which it may add.
         """
         self._end()
         self._answers = [set() for _ in self._sides]

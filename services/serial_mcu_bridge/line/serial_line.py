@@ -99,7 +99,7 @@ class SerialLine:
         """Send a drive line now, or after earlier bytes unless a newer one replaces it; False if there is no device.
 
         If it could not be sent for ``valid_s``, or for ``drive_timeout_s``, a stop is sent instead. ``line`` may
-        contain other lines, which share its fate; waiting lines of their kind ``replaces`` are dropped.
+        also hold a line of the kind ``replaces``, which expires with it; a waiting line of that kind is dropped.
         """
         outbox = self.output.outbox
         at_once = line if valid_s > 0 else b""  # else the outbox judges whether it has expired

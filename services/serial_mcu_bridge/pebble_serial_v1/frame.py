@@ -125,6 +125,6 @@ def _full_blocks(part: bytes) -> bytes:
 
 
 def _block(part: bytes) -> bytes:
-    """Return the rest of ``part``, after its full blocks, as a block; if data follow, the block implies a zero."""
+    """Return the end of ``part``, after its full blocks, as a COBS block, which also encodes a zero behind ``part``."""
     last = part[len(part) - len(part) % _BLOCK :]
     return bytes((len(last) + 1,)) + last

@@ -79,7 +79,7 @@ class Manifest:
         return self.hello.device_uid
 
     def payload(self) -> McuManifest:
-        """Return the manifest in its published form, ``outgoing/mcu/{uid}/describe``, with the original's keys."""
+        """Return the manifest as published on ``outgoing/mcu/{uid}/describe``, with the keys of the original Pebble."""
         interfaces = [_plain_interface(interface) for interface in self.interfaces]
         return McuManifest(protocol=PROTOCOL, **asdict(self.hello), interfaces=interfaces)
 

@@ -26,7 +26,7 @@ _CHECK_NS = 1_000_000_000  # how soon it is made again, and how often that is tr
 class HallMemory:
     """A ring of ``slots`` samples called ``name``. It is made for the first sample, and stays when its writer ends.
 
-    A reader maps it once, and waits for samples with greater numbers: so a writer continues the ring that it finds.
+    A reader maps it once, and goes by the number of the newest sample: so a writer continues the ring that it finds.
     """
 
     def __init__(self, name: str, slots: int = 2048) -> None:
@@ -59,7 +59,7 @@ class HallMemory:
             os.close(descriptor)
 
     def _keep(self) -> None:
-        """Open the memory if it is not open, or its file is gone: Python's SharedMemory removes it with a reader."""
+        """Open the memory if it is not open, or its file is gone: a reader by SharedMemory removes it when it ends."""
         if self._opened is not None and self._in_place(self._opened[0]):
             return
         self.close()

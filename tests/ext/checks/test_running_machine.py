@@ -10,14 +10,16 @@ from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
 from pebble.check_result import CheckResult
 from pebble.config import parse
-from pebble.extensions.checks.running import machine
+from pebble.extensions.checks.running import checks, machine
 from pebble.extensions.checks.running.robot import RobotUnderTest
 from pebble.extensions.fleet import authority, certificates
+from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.extensions.operator.places import Places
 from tests.support import free_port
 
@@ -37,7 +39,7 @@ UNITS: list[tuple[Mapping[str, str], str, str]] = [
 
 def judged(outcome: CheckResult, state: str, text: str) -> None:
     assert (outcome.state.value, text in outcome.text) == (state, True), outcome
-    assert bool(outcome.fix) is (state == "failed")
+    assert bool(outcome.fix) is (state in ("warn", "failed"))
 
 
 @pytest.mark.parametrize(("properties", "state", "text"), UNITS)
@@ -93,6 +95,31 @@ def test_the_disk(
     found = os.statvfs_result((1 << 20, 1 << 20, 10_000, free, free, 100, files, files, flags, 255))
     monkeypatch.setattr(os, "statvfs", lambda _: found)
     judged(machine.disk(under_test(tmp_path)), state, text)
+
+
+BATTERIES = [
+    (7.48, 2, False, "ok", "7.48 V"),
+    (7.47, 2, False, "warn", "7.47 V, 3.73 V a cell: it is below 20 %"),
+    (6.8, 2, False, "warn", "6.80 V, 3.40 V a cell: it is below 20 %"),
+    (6.79, 2, False, "failed", "6.79 V, 3.40 V a cell: it is nearly empty"),
+    (6.79, 2, True, "ok", "6.79 V, on the charger"),
+    (6.79, None, False, "ok", "6.79 V"),
+    (None, 2, False, "skipped", "it reports no voltage"),
+]
+
+
+@pytest.mark.parametrize(("volts", "cells", "charging", "state", "text"), BATTERIES)
+def test_the_battery(
+    volts: float | None, cells: int | None, charging: bool, state: str, text: str, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(checks, "_VOLTS_S", 0.0)
+    monkeypatch.setattr(checks, "_LOW_S", 0.0)
+    robot = under_test(tmp_path, robot={"id": "goob", "battery_cells": cells})
+    view = RobotView(robot.config.base)
+    view.volts, view.charging = volts, charging
+    robot.own = Mock(view=view)
+    judged(checks.battery(robot), state, text)
 
 
 @contextmanager

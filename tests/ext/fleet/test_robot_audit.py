@@ -15,6 +15,7 @@ from pebble.contract import AUTONOMY_COMMAND, CONTROL_TAKE, DRIVE, ESTOP, ESTOP_
 from pebble.contract import channels as c
 from pebble.extensions.fleet import robot_audit as audit_module
 from pebble.extensions.fleet.robot_audit import ROBOT, Audit, files
+from pebble.extensions.fleet.row_writer import OF_STRANGERS
 from pebble.forwarding.routing import Drop
 from tests.commands.command_line import Run
 from tests.services.mqtt_bridge.bridge_rig import MemoryRig, make_config
@@ -32,7 +33,8 @@ class Log:
     def __init__(self) -> None:
         config = make_config()
         self.path, self.older = files(config)
-        self.audit = Audit(config)
+        self.now = 0.0
+        self.audit = Audit(config, lambda: self.now)
         self.audit.start()
 
     def send(self, channel: c.Channel, sender: str | None, **payload: Any) -> None:
@@ -84,6 +86,18 @@ ROWS: dict[str, tuple[c.Channel, str | None, dict[str, Any], dict[str, Any] | No
                {"what": "flag", "who": "ann", **OUTSIDE, "name": "mqtt-video", "on": False}),
     "an action that is switched off": (c.REBOOT, "ann", {"value": False}, None),
     "a wish for control": (c.CONTROL, "ann", {"id": ID}, None),
+    "a sound": (c.SOUNDBOARD_COMMAND, "ann", {"action": "play", "file": "horn.wav", "repeat": 3},
+                {"what": "sound-start", "who": "ann", **OUTSIDE, "file": "horn.wav"}),
+    "its end, too": (c.SOUNDBOARD_COMMAND, None, {"enabled": False},
+                     {"what": "sound-stop", "who": "?", **OUTSIDE, "file": ""}),
+    "a light": (c.LIGHTS_FLASH, "ann", {"r": 0.2, "period": 1},
+                {"what": "lights", "who": "ann", **OUTSIDE, "on": True}),
+    "a light that goes out": (c.LIGHTS_SOLID, ROBOT, {"r": 0, "g": 0, "b": 0},
+                              {"what": "lights", "who": ROBOT, **INSIDE, "on": False}),
+    "an outlet": (c.OUTLET_COMMAND, "ann", {"on": True}, {"what": "outlet", "who": "ann", **OUTSIDE, "on": True}),
+    "a light in a group": (c.GROUP, "ann", {"drive-values": {"x": 1}, "lights-solid": {"g": 1}},
+                           {"what": "lights", "who": "ann", **OUTSIDE, "on": True}),
+    "a group that cannot be read": (c.GROUP, "ann", {"lights-solid": {"g": 1}, "reboot": {"value": True}}, None),
     "no script": (AUTONOMY_COMMAND, "ann", {}, None),
     "driving": (DRIVE, "ann", {"x": 1, "key": "sentinel"}, None),
     "a flag that cannot be read": (c.MQTT_VIDEO, "ann", {"value": "sentinel"}, None),
@@ -109,6 +123,21 @@ def test_a_stop_that_is_repeated_is_one_row_and_another_is_another(log: Log) -> 
     rows = log.rows()
     assert [row.get("stop") for row in rows[:250]] == [f"{number:016x}" for number in range(250)]
     assert [(row["who"], row.get("count", 1)) for row in rows[250:]] == [("ann?", 1), ("ann", 1), ("ann?", 1)]
+
+
+def test_lights_that_go_on_are_one_row_until_they_rest_and_sounds_leave_room(log: Log) -> None:
+    for now in (0.0, 30.0, 89.0, 150.0):
+        log.now = now
+        for colour in (1, 0, 1):
+            log.send(c.LIGHTS_SOLID, "ann", r=colour)
+    for number in range(200):
+        log.send(c.SOUNDBOARD_COMMAND, "eve", action="play", file=f"{number}.wav")
+    log.send(ESTOP, "ann", stop=STOP)
+    rows = log.rows()
+    assert [(row["what"], row.get("on")) for row in rows[:4]] == [("lights", True), ("lights", False)] * 2
+    sounds = [row for row in rows if row["what"] == "sound-start"]
+    assert len(sounds) == OF_STRANGERS - 2 + 2, "those beyond are counted"
+    assert {"what": "stop", "who": "ann", **OUTSIDE, "stop": STOP, "why": ""} in rows
 
 
 def test_control_is_given_and_ends(log: Log) -> None:

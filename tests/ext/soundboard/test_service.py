@@ -10,12 +10,14 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Self
+from unicodedata import normalize
 
 import numpy as np
 import pytest
 
 from pebble.contract import MEDIA_REPORT, codec
 from pebble.contract.payloads import MediaReport, SoundboardFiles
+from pebble.errors import PebbleError
 from pebble.extensions.lab.simulation.loudspeaker import Playback, playbacks
 from pebble.extensions.media.pcm import Samples
 from pebble.services.soundboard_handler.clips import Clips
@@ -178,7 +180,7 @@ def test_a_clip_is_listed_played_as_it_is_and_over(both: Soundboard) -> None:
     (played,) = both.played
     assert played.file == str(path), "called with the path, as aplay is"
     assert np.array_equal(both.samples(), tone(0.4, 2))
-    both.play("warn/b\u00e4r.WAV")
+    both.play("warn\\b\u00e4r.WAV")
     assert both.became(playing=True, file="warn/ba\u0308r.WAV"), "a name that looks the same"
 
 
@@ -354,14 +356,24 @@ def test_what_leads_outside_is_neither_listed_nor_found(tmp_path: Path) -> None:
 
 
 def test_the_folder_may_be_a_link_and_a_name_a_way_around(tmp_path: Path) -> None:
-    put(tmp_path / "real", "a.wav", "sub/b.wav")
+    bear, long = "sub/ba\u0308r.wav", 80 * "\ud55c" + ".wav"  # three times as long in its other form
+    put(tmp_path / "real", "a.wav", bear, long, "\u00c5.wav", "A\u030a.wav")
     (tmp_path / "link").symlink_to("real")
     clips = Clips(tmp_path / "link")
-    assert clips.scan() == ["a.wav", "sub/b.wav"]
-    for name in (str(tmp_path / "link" / "a.wav"), "sub\\../a.wav"):
+    assert clips.scan() == ["a.wav", "A\u030a.wav", bear, "\u00c5.wav", long]
+    names = {
+        str(tmp_path / "link" / "a.wav"): "a.wav",
+        "sub\\../a.wav": "a.wav",
+        "sub\\b\u00e4r.wav": bear,
+        str(tmp_path / "link" / "sub/b\u00e4r.wav"): bear,
+        normalize("NFD", long): long,
+        "A\u030a.wav": "A\u030a.wav",
+    }
+    for name, expected in names.items():
         clip = clips.find(name)
-        assert clip is not None
-        assert clip.name == "a.wav"
+        assert (name, clip and clip.name) == (name, expected)
+    with pytest.raises(PebbleError, match="2 names look like this"):
+        clips.find("\u212b.wav")
 
 
 def test_the_list_is_bounded_and_what_is_not_listed_can_be_played(tmp_path: Path) -> None:

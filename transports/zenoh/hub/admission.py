@@ -40,7 +40,7 @@ class Admission:
         return {}
 
     def hello(self, account: str, hello: Hello) -> Hello | None:
-        """Return ``hello`` in the form to store; None if it gets no answer."""
+        """Return a client's ``hello``, reduced to what the client may do; None if the hub must not answer."""
         return None if account else hello
 
     def owns(self, account: str, session: str) -> bool:

@@ -58,7 +58,7 @@ class HubStore:
         return [key for key, its_digest in hello.own.items() if self._differs(key, its_digest, hello.name)]
 
     def _differs(self, key: str, its_digest: int | None, client: str) -> bool:
-        """True if ``client`` should send its value of ``key``; ``its_digest``: the digest of that, None if removed."""
+        """True if ``client`` should send its value of ``key``. ``its_digest``: of that value; None: it was removed."""
         retained = self._retained.get(key)
         if retained is None:
             return its_digest is not None

@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 
-from pebble.check_result import CheckResult, failed, ok, warn
+from pebble.check_result import CheckResult, State, failed, ok, warn
 from pebble.config.security import SecurityLevel
 from pebble.contract import BRIDGE_PROBE, ONLINE
 from pebble.contract.identity import SERVERS, Identity
@@ -40,25 +40,17 @@ def robot_account(
     try:
         with reached(settings, "") as trial:
             trial.patience_s = answer_s
-            peer = trial.peer(protocol=settings.protocol)
-            if reads and (why := _why_not_granted(peer, reads)):
-                text = f"a page with this account does not hear robots: {why} {reads}"
-                yield failed(text, "pebble fleet check; its role is page", what)
-                return
-            topic = BRIDGE_PROBE.topic(base)
-            peer.subscribe(topic)
-            is_back, refusal = _echo(trial, peer, topic)
+            peer, topic = trial.peer(protocol=settings.protocol), BRIDGE_PROBE.topic(base)
             must_come_back = bool(reads) or settings.protocol != "5"  # before MQTT 5 no refusal is told
-            if refusal or (must_come_back and not is_back):
-                why = refusal or "it does not come back (or may this account not read it?)"
-                fix = f"allow it to write and read {topic.rpartition('/')[0]}/# on the broker"
-                yield failed(f"this account may not publish to {topic}: {why}", fix, what)
+            result = trial.judge(lambda trial: _rights(trial, peer, topic, reads, must_come_back=must_come_back))
+            yield replace(result, what=what)
+            if result.state is State.FAILED:
                 return
-            yield ok("accepts what this account publishes", what=what)
             if level != "open":
                 yield _rules(what, trial, peer, topic)
-            if is_back and trial.round_trip_s >= _MATTERS_S:
-                yield replace(held_back(trial, peer, peer, topic), what=f"small messages at {what}")
+            if trial.round_trip_s >= _MATTERS_S:
+                result = trial.judge(lambda trial: held_back(trial, peer, peer, topic))
+                yield replace(result, what=f"small messages at {what}")
     except TransportError as error:
         yield warn(f"cannot be published to: {error}", what=what)
 
@@ -67,6 +59,20 @@ def page_account(what: str, settings: MqttSettings, level: SecurityLevel = "open
     """Check that a page server with this account receives what robots publish, and may publish itself."""
     base, states = Identity("pebble", SERVERS, "doctor").base, ONLINE.filter("+/+/+")
     return robot_account(what, settings, base, level=level, reads=states)
+
+
+def _rights(trial: BrokerTrial, peer: Peer, topic: str, reads: str, *, must_come_back: bool) -> CheckResult:
+    """Check that this account may read ``reads``, if that is given, and publish to ``topic``."""
+    if reads and (why := _why_not_granted(peer, reads)):
+        text = f"a page with this account does not hear robots: {why} {reads}"
+        return failed(text, "pebble fleet check; its role is page")
+    peer.subscribe(topic)
+    is_back, refusal = _echo(trial, peer, topic)
+    if refusal or (must_come_back and not is_back):
+        why = refusal or "it does not come back (or may this account not read it?)"
+        fix = f"allow it to write and read {topic.rpartition('/')[0]}/# on the broker"
+        return failed(f"this account may not publish to {topic}: {why}", fix)
+    return ok("accepts what this account publishes")
 
 
 def _why_not_granted(peer: Peer, filter_: str) -> str:

@@ -25,7 +25,7 @@ def _probe(
         except RefusedError as error:
             return failed(f"a connection was refused: {error}", "let an account have ten connections at once")
 
-    return Check(name, begin_and_test, needs, costs)
+    return Check(name, lambda trial: trial.judge(begin_and_test), needs, costs)
 
 
 PROBES = (

@@ -66,6 +66,7 @@ def order(trial: BrokerTrial) -> CheckResult:
             writer.publish("state", b"%d" % newest, qos=trial.qos, retain=True)
         reader.subscribe("state", qos=trial.qos)
     writer.ping()
+    trial.wait(lambda: all(b"%d" % newest in reader.payloads() for reader in readers))
     trial.wait_quiet(*readers)
     wrong = [reader for reader in readers if reader.payloads()[-1:] != [b"%d" % newest]]
     # A last message with the retain flag was sent for the subscription, but later than newer live ones. Without the

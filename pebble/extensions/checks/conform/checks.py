@@ -64,7 +64,7 @@ def commanded(robot: Observer) -> str:
 
 
 def readable(robot: Observer) -> str:
-    """Return why this account cannot read requests to the robot; empty if a trial one arrives, changing nothing."""
+    """Return why this account cannot read requests to the robot; empty if it gets back the harmless one it sends."""
     account = (robot.account or "") if robot.view.named else ""
     is_read = robot.send_as(account, c.CONTROL, ControlRequest(id=secrets.token_hex(4), want="release"))
     return "" if is_read else "its broker does not let this account read incoming/: use an admin's"

@@ -220,9 +220,9 @@ def _stop_moving(robot: Observer, driver: Driver) -> CheckResult:
 
 
 def _reset_waits(robot: Observer, driver: Driver) -> CheckResult:
-    """Check that a stick held down over a reset moves nothing, and that another's zero does not end that wait."""
+    """Check that a stick held down over a reset moves nothing until released; another client's zero is no release."""
     stop(robot, secrets.token_hex(8))
-    began, _ = driver.drive(2 * STEP_S)  # from before the reset on: a pause would end the wait
+    began, _ = driver.drive(2 * STEP_S)  # from before the reset on: a pause would count as a release
     reset(robot)
     driver.drive(DRIVES_S / 2)
     if robot.view.controlled:
@@ -231,7 +231,7 @@ def _reset_waits(robot: Observer, driver: Driver) -> CheckResult:
     why = "a stick that is held down moves it after a reset"
     outcome = _moved(robot, began, why, "wait for a zero of who has control, or for 0.5 s without commands")
     if outcome.state is State.OK:
-        driver.send()  # the zero that ends the wait: now it must move
+        driver.send()  # the zero that counts as a release: now it must move
         outcome = _rest(robot, *driver.drive(), RESTS_S)
     is_free = robot.wait(lambda: not robot.view.latched, ANSWER_S)
     return outcome if is_free else failed("a reset does not end the stop", END_IT)

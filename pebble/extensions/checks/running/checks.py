@@ -6,7 +6,7 @@ import math
 import shlex
 from itertools import pairwise
 
-from pebble.check_result import CheckResult, failed, ok, skipped
+from pebble.check_result import CheckResult, failed, ok, skipped, warn
 from pebble.contract.levels import LEVELS, silent_after
 from pebble.extensions.checks.check import Check, some_of
 from pebble.extensions.checks.observer import available, why_not_free
@@ -24,7 +24,8 @@ _LONGEST_GAP = 2.5  # times the interval that its config has
 _JUDGED_S = 6.0  # for the judgement whether motors obey: motor owners repeat every 5 s what it is based on
 _VOLTS_S = 6.0  # boards report it every five seconds
 _LOW_S = 2 * _VOLTS_S  # one reading is no empty battery
-_LEAST_CELL_V = 3.4  # of a lithium cell: below, a robot has minutes
+_LOW_CELL_V = 3.74  # of a lithium cell: 20 %, below which the page warns, too
+_LEAST_CELL_V = 3.4  # below, a robot has minutes
 _SHOWN = 5  # names in one line
 _LOG = "journalctl -u pebble -n 50"
 
@@ -182,20 +183,22 @@ def _mcu(robot: RobotUnderTest, name: str) -> dict[str, object]:
 
 
 def battery(robot: RobotUnderTest) -> CheckResult:
-    """Report the battery's voltage; fail if it stays too low for the config's number of cells."""
+    """Report the battery's voltage; warn if it stays low for the config's number of cells, fail if nearly empty."""
     robot.wait(lambda: robot.view.volts is not None, _VOLTS_S)
     volts, cells = robot.view.volts, robot.config.robot.battery_cells
     if volts is None:
         return skipped("it reports no voltage")
-    least = (cells or 0) * _LEAST_CELL_V
 
     def is_enough() -> bool:
-        return (robot.view.volts or 0.0) >= least
+        return (robot.view.volts or 0.0) >= (cells or 0) * _LOW_CELL_V
 
     charging = ", on the charger" if robot.view.charging else ""
     if cells and not charging and not robot.wait(is_enough, _LOW_S):
         volts = robot.view.volts or 0.0
-        return failed(f"{volts:.2f} V, {volts / cells:.2f} V a cell: it is nearly empty", "charge it")
+        text = f"{volts:.2f} V, {volts / cells:.2f} V a cell"
+        if volts < cells * _LEAST_CELL_V:
+            return failed(f"{text}: it is nearly empty", "charge it")
+        return warn(f"{text}: it is below 20 %", "charge it soon")
     return ok(f"{robot.view.volts:.2f} V{charging}")
 
 

@@ -344,7 +344,7 @@ def _locked_fleet(folder_: Path | None, *, any_rules: bool = False) -> Iterator[
 
 
 def _place(folder_: Path | None) -> Path:
-    """Return the named folder, or else the only fleet below the current one. Raises PebbleError."""
+    """Return ``folder_``; None: the only folder with a fleet, the current one or one in it. Raises PebbleError."""
     if folder_ is not None:
         return folder_.absolute()
     folders = [Path(), *sorted(path for path in Path().iterdir() if path.is_dir() and not path.name.startswith("."))]

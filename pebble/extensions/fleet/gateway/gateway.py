@@ -167,7 +167,7 @@ class Gateway:
         return all(transport.state is State.CONNECTED for transport in (self._hub, self._broker, self._presence))
 
     def _leave_to_others(self, now: float) -> None:
-        """End the robots that another gateway carries; at the start, raise SecondGatewayError if there is one."""
+        """Stop carrying robots that another gateway carries; at the start, raise SecondGatewayError for them."""
         for base in list(self._heard):
             other = self._others.carrier(base, now, carried=base in self._carried)
             if not other:

@@ -83,9 +83,9 @@ def flash(
 
 
 def _target(robot: str, firmware: str | None) -> tuple[Firmware, Config | None]:
-    """Return the firmware, and the config: the file ``robot``, or for a firmware's name the one that Pebble has.
+    """Return the firmware and the config for ``robot``, the path of a config or the name of a firmware.
 
-    None for the name of a firmware without Wi-Fi, which needs no config.
+    For a name it is the config that comes with Pebble; None for a firmware without Wi-Fi, which needs none.
     """
     if robot in FIRMWARE:
         target = firmware_named(firmware or robot)

@@ -36,7 +36,7 @@ def make(new: Path, fleet: Fleet, passwords: dict[str, str]) -> None:
 
 
 def link(place: Path) -> None:
-    """Make links from mosquitto's places to the folder; relative ones, which are also valid below another root."""
+    """Make links in ``place`` to mosquitto's configuration and pid file; relative, so valid below another root."""
     for name, target in LINKS.items():
         if not (place / name).is_symlink():
             (place / name).symlink_to(target)

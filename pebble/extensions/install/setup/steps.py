@@ -156,7 +156,7 @@ class Job:
                 yield self._new_password("password of the page at the robot's broker", page)
 
     def _new_password(self, what: str, file: Path, *, known: bool = True) -> Step:
-        """Return the step that writes a new password. ``known``: a password in the file is this broker's, and stays."""
+        """Return the step that writes a new password. With ``known``, a password that is in the file already stays."""
         write = partial(self.system.write, file)
         return Step(what, lambda: known and file.exists(), lambda: write(f"{new_password()}\n".encode()))
 

@@ -173,7 +173,7 @@ class StandIn(Robot):
 
 
 class CFloor(StandIn):
-    """The two programs in C: the lower limit for robots of two programs and a broker."""
+    """A stand-in whose two programs are written in C: the lower limit for robots of two programs and a broker."""
 
     def command(self) -> list[str]:
         return [str(compiled(self.folder / "floor"))]

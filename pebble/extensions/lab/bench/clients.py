@@ -61,7 +61,7 @@ class StockClient:
         return self
 
     def wait(self) -> None:
-        """Wait until subscriptions, or else the connection, are acknowledged. Raises PebbleError."""
+        """Wait until the subscriptions are acknowledged, or the connection if there are none. Raises PebbleError."""
         if not self._ready.wait(_ANSWER_S):
             raise PebbleError(f"the broker acknowledged nothing within {_ANSWER_S:.0f} s")
 

@@ -88,7 +88,7 @@ STEPS = (*(step.name for step in SCRIPT), EMERGENCY_STOP, AFTER_RESET)  # of eve
 
 
 class EndedEarlyError(Exception):
-    """An error that ends a step: the demo ends, or a person has taken the robot with the script."""
+    """An error that ends a step: the demo ends, or a person has taken the robot that runs a script."""
 
 
 class Operator:
@@ -346,7 +346,7 @@ class Operator:
             self._wait(0.0)  # raises if the demo ends
 
     def _follow(self, robot: RobotView) -> None:
-        """Start the script, drive for a moment, and wait until it has arrived."""
+        """Start the script, drive in its place for a moment, and wait until it has brought the robot to the tag."""
         tags: deque[TagData] = deque(maxlen=1)
 
         def receive(message: Message) -> None:

@@ -13,7 +13,7 @@ _SENT = 1000  # drive commands of the operator that are on their way back: 50 s 
 
 
 class Visitors:
-    """A table of the robots that people have: until its next step begins, the operator leaves them alone.
+    """A table of the robots that people have. The demo's operator leaves them alone until it begins its next step.
 
     Times are seconds of one monotonic clock.
     """

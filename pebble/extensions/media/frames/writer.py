@@ -72,7 +72,7 @@ class FrameWriter:
     # -- opening and closing
 
     def open(self) -> Self:
-        """Open the writer. Raises TransportError if it cannot listen there, for example beside another."""
+        """Open the writer. Raises TransportError if it cannot listen, for example beside another writer."""
         prepare_run_dir(self._names.folder)
         self._sweep()
         self.problem = self._why_not_shared()

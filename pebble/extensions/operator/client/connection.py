@@ -123,9 +123,9 @@ def _account(settings: Any) -> str | None:
 
 
 def put_account_into_topics(transport: Transport, names: Names, is_named: Callable[[str], bool]) -> None:
-    """Let the transport put this client's account into the topics of commands, if ``is_named(base)``.
+    """Let the transport put this client's account into the topics of commands, for robots that read only such topics.
 
-    Some robots read commands only at such topics.
+    ``is_named(base)`` returns True if the robot with this base is one of them.
     """
     if names.account is not None:
         transport.policy.forms = NamedTopics(names.account, is_named).forms

@@ -1,7 +1,7 @@
 """Accounts in the topics of commands, for robots that accept only such commands. Pure.
 
-A robot's capabilities tell whether it does (``named``). With :meth:`NamedTopics.forms` as a transport's forms, each
-command is published on the topic that its robot reads at present.
+The capabilities of such a robot have ``named``. With :meth:`NamedTopics.forms` as its ``policy.forms``, a transport
+publishes each command on the topic that its robot reads at present.
 """
 
 from collections.abc import Callable, Iterator
@@ -31,7 +31,7 @@ def why_not(name: str, account: str) -> str:
 
 
 class NamedTopics:
-    """A client's topics, for ``account``, its user name at the broker; ``is_named(base)``: that robot needs one."""
+    """A client's topics. ``account``: its user name at the broker; ``is_named(base)``: that robot needs an account."""
 
     def __init__(self, account: str, is_named: Callable[[str], bool]) -> None:
         self.account = account

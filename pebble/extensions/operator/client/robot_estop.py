@@ -78,7 +78,7 @@ class RobotEstop:
     def missing_control(self) -> list[str]:
         """Return the topics of the control states that are missing, if the robot publishes control.
 
-        The owners are those whose stop state is missing: a broker keeps back both states of an owner, or none.
+        They count as missing with the stop state of the same owner: a broker keeps back both states, or none.
         """
         owners = [owner for owner in self.owners if owner not in self._states] if self.keeps_control else []
         return [CONTROL_STATE.topic(self.base, owner=owner) for owner in owners]

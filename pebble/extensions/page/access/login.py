@@ -71,7 +71,7 @@ def routes() -> list[Route]:
 def session_of(connection: HTTPConnection) -> Session | None:
     """Return the session of a request, read from the database each time; None without one.
 
-    On a server without a login: LOCAL with its ``name``.
+    On a server without a login: the session LOCAL, with the person's ``name`` in the query of the address.
     """
     settings: WebSettings = connection.app.state.settings
     session: Session | None = None

@@ -64,7 +64,7 @@ class SoundQueue:
 
 
 class SoundPage:
-    """A page that plays a robot's sound, or talks to the robot. ``can`` empty: it only talks."""
+    """A page for a robot's sound, both ways. ``can``: the encodings that it plays; if none, it only talks."""
 
     def __init__(self, can: frozenset[str], session: Session, device: str = "", address: str = "") -> None:
         self.can, self.session, self.device, self.address = can, session, device, address

@@ -132,7 +132,7 @@ class RobotSource:
 
 
 class PlayedRobot:
-    """The output of a player: it sends the messages of a recorded robot to the page, in the form that pages read."""
+    """The output of the player of one robot's recording: it sends messages in the form that pages read."""
 
     def __init__(self, link: Link, archive: Archive, ref: str, at_ns: int) -> None:
         self.sent = self.skipped = 0  # an output has them; nothing is counted here

@@ -105,7 +105,7 @@ class Recordings:
     async def timeline(self, day: str, robot: str, *, again: bool = False) -> bytes | float:
         """Return the timeline as JSON or, while none is made yet, the finished share of the work. Raises PebbleError.
 
-        After a failure it is made again only with ``again``, or for other recordings.
+        After a failure it is made again only with ``again``, or if the day has other recordings by now.
         """
         key, period = (day, robot), _period_of(day)
         paths, active = await self.process.ask(questions.files, robot, *period)

@@ -108,7 +108,7 @@ class Folder:
                 return True
 
     def create(self, lane: str, now_ns: int) -> tuple[BinaryIO, Path]:
-        """Create a file to write to. Raises OSError."""
+        """Create a file to write to; ``lane``: what it holds, STATE or MEDIA with a name. Raises OSError."""
         self._number += 1
         moment = time.gmtime(max(0, now_ns) // 10**9)
         day = self.root / time.strftime(_DAY, moment)

@@ -114,7 +114,7 @@ class OpenFile:
 def lane_of(topic: str, *, is_media: bool) -> str:
     """Return the lane of a message.
 
-    A robot's media have a lane if its identity can be part of a file name.
+    A robot's media have a lane of their own if its identity can be part of a file name; all others share one.
     """
     if not is_media:
         return STATE

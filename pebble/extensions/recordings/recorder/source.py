@@ -23,9 +23,9 @@ _LOSSES: Final = ("too_long", "malformed")  # messages that a transport has drop
 class Source:
     """A connection whose messages are recorded, and whose changes are recorded as events.
 
-    With MQTT 5's retain-as-published it sees which live messages were published to be retained, but could not tell
-    those from older ones. Besides, brokers send only some 1,000 retained messages with QoS 1. So each connection to a
-    broker has a second one, which fetches the retained messages with QoS 0 and ends.
+    MQTT 5's retain-as-published shows which live messages were published to be retained, but they look like the old
+    ones that the broker has retained. Besides, brokers send only some 1,000 retained messages with QoS 1. So each
+    connection to a broker has a second one, which fetches the retained messages with QoS 0 and ends.
     """
 
     def __init__(self, recorder: Recorder, kind: str, settings: Any, filters: Iterable[str], name: str = "") -> None:

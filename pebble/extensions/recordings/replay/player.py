@@ -25,7 +25,7 @@ class Source(Protocol):
         ...
 
     def state_before(self, at_ns: int, publishes: Chooses) -> list[Recorded]:
-        """Return what a subscriber would know at a time; last, the pictures that the next one builds on."""
+        """Return what a subscriber would know at a time, then the pictures without which the next cannot be decoded."""
         ...
 
 

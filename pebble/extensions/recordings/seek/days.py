@@ -23,7 +23,7 @@ _MOST_DAYS: Final = 31  # of one chunk
 class Day(Struct):
     """A day (UTC). ``first``, ``last``: epoch milliseconds. ``gaps``: times that were not recorded.
 
-    ``driven``: the seconds in which a robot was sent drive commands, by robot. A chunk that has any counts in full.
+    ``driven``: the seconds in which a robot was sent drive commands, by robot. A chunk with a command counts in full.
     ``unread``: a line for each file that cannot be read completely, on the day of its last change.
     """
 

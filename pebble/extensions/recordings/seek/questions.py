@@ -132,7 +132,7 @@ class _Progress:
 
 
 def answer_with(answer: Connection, work: Callable[[], str]) -> None:
-    """Do the ``work`` of a job, which returns what it could not read; answer with the result."""
+    """Do a job's ``work``; answer "ready", with the damage in words that ``work`` returns, or "failed" and why."""
     try:
         answer.send(("ready", work()[:_LONGEST_WHY]))
     except Exception as error:

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from pebble.config.visible import shown
+from pebble.contract.identity import meant
 from pebble.contract.payloads import AutonomyStatus
 from pebble.errors import PebbleError, TransportError
 from pebble.extensions.operator.client import forms
@@ -82,6 +83,7 @@ def start(
     if not file or file.startswith("-"):
         raise PebbleError(f'which script? see "pebble script list {robot}"')
     with _scripts(robot, target) as (transport, scripts, _):
+        file = meant(scripts.files or (), file)
         before, answers_before, began = scripts.status, scripts.answers, time.monotonic()
         _require_sent(transport, scripts.start(transport, file, context.args))
 

@@ -39,7 +39,7 @@ class Guard:
         os._exit(128 + number)
 
     def _next(self, timeout: float | None) -> int:
-        """Return the next signal that ends the script; after the first only Ctrl-C, or 0 after ``timeout`` seconds."""
+        """Return the next signal that ends the script. With ``timeout`` only Ctrl-C counts; 0 if it does not come."""
         wanted = _NUMBERS if timeout is None else (signal.SIGINT,)
         while True:
             readable, _, _ = select.select([self._reader], [], [], timeout)

@@ -61,16 +61,18 @@ def scripts(folder: Path, **section: Any) -> dict[str, Script]:
 
 
 def test_folders_with_an_entry_point_are_scripts(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    for name in ("beta", "Alpha", ".hidden", "_draft", "off", "bad]name"):
+    for name in ("beta", "Alpha", ".hidden", "_draft", "off", "bad]name", "\u212b"):
         write(tmp_path, name)
     write(tmp_path, "other", file="main.py")
     write(tmp_path, "empty", file="README")
     (tmp_path / "run.py").write_text("")
     (tmp_path / "elsewhere").symlink_to(tmp_path / "beta")
-    found = scripts(tmp_path, scripts={"off": {"enabled": False}, "other": {"entrypoint": "main.py"}})
+    two = {"\u00c5": {"enabled": False}, "A\u030a": {}}
+    found = scripts(tmp_path, scripts={"off": {"enabled": False}, "other": {"entrypoint": "main.py"}, **two})
     assert list(found) == ["Alpha", "beta", "elsewhere", "other"]
     assert found["beta"].command == ("/usr/bin/python3", str(tmp_path / "beta/run.py"))
     assert "'bad]name' is not offered: rename its folder" in caplog.text
+    assert "\u212b is not offered: in services.autonomy_manager.scripts 2 names" in caplog.text
     assert scripts(tmp_path / "missing") == {}
 
 

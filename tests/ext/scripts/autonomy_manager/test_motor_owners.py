@@ -137,6 +137,8 @@ SCRIPTS = {
     "late": script("late", Dependency("new")),
     "torn": structs.replace(script("torn"), broken="run.py, line 3: invalid syntax"),
     "fast": script("fast", Dependency("eyes", {"speed": 9})),
+    "\u00c5": script("\u00c5"),
+    "A\u030a": script("A\u030a"),
 }
 
 
@@ -165,6 +167,7 @@ def test_a_script_is_started_by_a_name_that_looks_the_same(there: str, typed: st
         ("torn", {"speed": 2}, "Failed to start torn: run.py, line 3: invalid syntax"),
         ("late", {}, "Failed to start late: new: it is still asked what it needs"),
         ("fast", {}, "Failed to start fast: Invalid config for eyes: speed above maximum 1"),
+        ("\u212b", {}, "Unknown autonomy file: \u212b: 2 names look like this: rename all but one"),
     ],
 )
 def test_a_start_that_is_not_possible_is_refused_with_the_originals_words(

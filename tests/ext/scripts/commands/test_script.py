@@ -36,8 +36,11 @@ class Manager:
         self._transport = create("mqtt", "manager", MqttSettings(host="127.0.0.1", port=port)).open()
         self._transport.subscribe(AUTONOMY_COMMAND.topic(GOOB), self._receive)
         self.then: list[AutonomyStatus] = []
-        self._publish(AUTONOMY_FILES, AutonomyFiles(files=[ENTRY], timestamp=1.0))
+        self.offer("follow")
         self.publish(AutonomyStatus(running=False, timestamp=1.0))
+
+    def offer(self, file: str) -> None:
+        self._publish(AUTONOMY_FILES, AutonomyFiles(files=[ENTRY | {"file": file}], timestamp=1.0))
 
     def publish(self, status: AutonomyStatus) -> None:
         self._publish(AUTONOMY_STATUS, status)
@@ -77,13 +80,15 @@ def test_it_lists_scripts_and_their_options(run: Run, config: Path, manager: Man
     assert "(slow, fast; default: slow)" in run.out
 
 
-def test_it_starts_a_script_with_options(run: Run, config: Path, manager: Manager) -> None:
+@pytest.mark.parametrize(("there", "typed"), [("follow", "follow"), ("fo\u0308llow", "f\u00f6llow")])
+def test_it_starts_a_script_with_options(run: Run, config: Path, manager: Manager, there: str, typed: str) -> None:
+    manager.offer(there)
     effective = {"tag_id": 7, "search": False}
-    manager.answers = [AutonomyStatus(running=True, timestamp=2.0, file="follow", pid=42, config=effective)]
-    assert run("script", "start", config, "follow", "--tag-id", "7", "--no-search", "--size-m=0.2") == 0, run.err
+    manager.answers = [AutonomyStatus(running=True, timestamp=2.0, file=there, pid=42, config=effective)]
+    assert run("script", "start", config, typed, "--tag-id", "7", "--no-search", "--size-m=0.2") == 0, run.err
     chosen = {"tag_id": 7, "search": False, "size_m": 0.2}
-    assert manager.commands == [{"action": "start", "file": "follow", "config": chosen}]
-    assert run.out.splitlines() == ["follow runs (process 42)", "    tag_id: 7", "    search: False"]
+    assert manager.commands == [{"action": "start", "file": there, "config": chosen}]
+    assert run.out.splitlines() == [f"{there} runs (process 42)", "    tag_id: 7", "    search: False"]
 
 
 def test_a_script_that_dies_at_once_is_an_error(run: Run, config: Path, manager: Manager) -> None:

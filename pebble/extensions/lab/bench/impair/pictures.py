@@ -92,7 +92,7 @@ def _draw_trials(cells: Sequence[Cell], title: str, shown_panels: Sequence[Panel
 def _draw_lines(
     axes: Axes, cells: Sequence[Cell], names: Sequence[str], style_of: Mapping[str, Style], panel: Panel
 ) -> list[float]:
-    """Draw one line per subject, and the references; return all values."""
+    """Draw a line per variant of the robot, the original's values and the paper's words; return the values."""
     value_of = {}  # by subject and trial
     for cell in cells:
         value = cell.percentile(panel.percent)

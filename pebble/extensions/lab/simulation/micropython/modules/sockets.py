@@ -69,7 +69,7 @@ class HostNetwork:
         self.servers = Servers()
 
     def modules(self) -> dict[str, Any]:
-        """Power off, as each boot does, and return the modules for the board."""
+        """Close all sockets and turn the radio off, as each boot does; return the modules for the board."""
         self.power_off()
         return {
             "network": network_module(self.radio),
