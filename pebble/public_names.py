@@ -28,7 +28,7 @@ PUBLIC = {
 class PublicNames:
     """A finder of modules by their public names.
 
-    It stands before Python's own finders, which would load a part of such a package a second time, by its path.
+    It stands before Python's own finders, which would load a module of a public package a second time, by its path.
     """
 
     @staticmethod

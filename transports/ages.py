@@ -23,8 +23,8 @@ K = TypeVar("K", bound=Hashable)
 class Patience(Struct, frozen=True):
     """Times in seconds after which a sender is believed whose messages all seem late: its clock was changed.
 
-    ``believed_s`` counts in general, ``set_back_s`` if its stamps went back, which no delay explains. This holds only
-    while no two of its messages are more than ``gap_s`` apart. A sender that was silent for ``silent_s`` is forgotten.
+    ``set_back_s`` counts if the sender's stamps went back, which no delay explains, else ``believed_s``. A pause longer
+    than ``gap_s`` begins the time anew. A sender that was silent for ``silent_s`` is forgotten.
     """
 
     believed_s: float
@@ -61,8 +61,8 @@ class _Clock:
 class SenderClocks(Generic[K]):
     """The clocks of at most ``most`` senders, each identified by a key.
 
-    If there is no room, a silent sender is forgotten. If none is silent, it is the sender with the shortest time from
-    its first to its last message: a flood of invented keys does not displace a sender that continues.
+    If there is no room, a silent sender is forgotten; if none is silent, the sender with the shortest time between its
+    first and its newest message: a flood of invented keys does not displace a sender that continues.
     """
 
     def __init__(self, most: int, patience: Patience) -> None:
@@ -77,7 +77,7 @@ class SenderClocks(Generic[K]):
         """Return the seconds that a message stamped ``sent`` has waited at ``now``; learn the sender's clock from it.
 
         A message that has waited for more than ``late_s`` is late. ``waited_s``: the longest time that the message can
-        have waited, by other evidence. It is the least age while the clock is younger than two seconds.
+        have waited, by other evidence. Until the clock is two seconds old, no smaller age is returned.
         """
         with self._lock:
             clock = self._clocks.get(key)
@@ -94,7 +94,7 @@ class SenderClocks(Generic[K]):
             return age if now - clock.began >= _YOUNG_S else max(age, waited_s)
 
     def is_passed(self, key: K, sent: float) -> bool:
-        """True if a message newer by up to a second was received. If it is newer by more, the clock was set back."""
+        """True if the newest stamp is later than ``sent`` by less than a second. If by more, the clock was set back."""
         with self._lock:
             clock = self._clocks.get(key)
             return clock is not None and clock.newest - _JUMP_S < sent < clock.newest

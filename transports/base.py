@@ -469,15 +469,15 @@ class Transport(ABC):
             subscription.renew()
 
     def _sync_retained(self, known_topics: Collection[str]) -> None:
-        """Send the pending retained messages, then our others, except those of topics that the other end has (T9)."""
+        """Send the pending retained messages; then our others but ``known_topics``, which the other end has (T9)."""
         with self._publishing:
             self._own.send_again(known_topics, lambda message: self._send(message, False))
 
     def _initial_sync(self, known_topics: Collection[str]) -> None:
         """Finish a new connection that has its subscriptions: send what the other end lacks, and set CONNECTED.
 
-        Until then the ``_send`` of a backend that calls this accepts only these messages (while ``_own.syncing``).
-        Retained messages that are published meanwhile become pending: the second sync sends them.
+        Until CONNECTED, the ``_send`` of a backend that calls this accepts only what is sent here (``_own.syncing``).
+        Retained messages that are published meanwhile become pending; they are sent here last, after CONNECTED.
         """
         self._sync_retained(known_topics)
         self._set_state(State.CONNECTED)

@@ -41,7 +41,7 @@ class OwnRetained(BoundedTable[Message]):
         return True
 
     def send_again(self, known_topics: Collection[str], send: Callable[[Message], bool]) -> None:
-        """Send the pending messages, then the others, except those of ``known_topics``."""
+        """Send the pending messages; then all others but those on ``known_topics``."""
         pending = [self[topic] for topic in self.pending]
         others = [message for topic, message in self.items() if topic not in self.pending and topic not in known_topics]
         self.syncing = True

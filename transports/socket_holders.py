@@ -39,7 +39,7 @@ def why_not(error: OSError, port: int) -> str:
 
 
 def port_holder(port: int) -> str:
-    """Return who listens at a port, or "": `` (by process 12 of user 1000: 'nc -l 8080')``, with the blank."""
+    """Return who listens at a port, as `` (by process 12 of user 1000: 'nc -l 8080')`` with its blank; else ""."""
     users = {}  # of listening sockets at the port, by their inodes
     for name in ("tcp", "tcp6"):
         with suppress(OSError):

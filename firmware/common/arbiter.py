@@ -2,7 +2,7 @@
 
 Boards and Linux robots share it.
 
-A drive command with all axes 0 is a zero. A person's zero is always judged. Commands of a script carry the number of
+A drive command with all axes 0 is a zero. A person's zero is never refused. Commands of a script carry the number of
 its run, which grows with each start; a run that is barred never moves anything again. The numbers have no end: after
 LAST_RUN comes 1, so whatever number a stranger sends, there is a newer one.
 """

@@ -1,4 +1,4 @@
-"""Values that the original accepts and our keys do not: other forms, and numbers beyond the limits. Pure."""
+"""Values that the original Pebble accepts and our keys do not: other forms, and numbers beyond the limits. Pure."""
 
 import math
 from typing import Any, Literal, NamedTuple, get_origin
@@ -60,11 +60,11 @@ def reading_of(annotation: Any, kind: Any, metas: list[Meta], raw: Any, default:
 
 
 def _forms(kind: Any, extra: dict[str, Any], raw: Any, number: float | None) -> list[Any]:
-    """Return the forms of ``raw`` to try for this kind of value; msgspec itself reads numbers in texts."""
+    """Return the forms of ``raw`` to try for ``kind``; ``number``: its value, if any; ``extra``: see `reading_of`."""
     if kind is bool:
         state = switch(raw)
         return [] if state is None else [state]
-    forms = [raw] if isinstance(raw, str | int | float) else []
+    forms = [raw] if isinstance(raw, str | int | float) else []  # msgspec itself reads numbers in texts
     if isinstance(raw, int) and number is not None and (kind is str or get_origin(kind) is Literal):
         forms.append(str(raw))
     if number is not None and "circle" in extra and number.is_integer():

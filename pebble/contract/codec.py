@@ -253,7 +253,7 @@ def _numbers(channel: Channel, command: dict[str, Any], remark: Remark) -> dict[
 
 
 def _number(channel: Channel, name: str, value: Any) -> float | None:
-    """Return the number in ``value``, perhaps as text; None if it is none. Raises PayloadError for NaN and infinity."""
+    """Return ``value``, a number or its text, as a number; else None. Raises PayloadError for NaN and infinity."""
     if isinstance(value, str):
         if "nan" in value.lower() or "inf" in value.lower():
             raise PayloadError(f"{channel.metric}: {name} is not a finite number")

@@ -211,7 +211,7 @@ class Heartbeat(Payload, frozen=True, kw_only=True):
 class GatewayHeartbeat(Payload, frozen=True, kw_only=True):
     """Sign of life of a gateway, on ``outgoing/online`` of its own identity; as the will the topic is emptied."""
 
-    t: int  # epoch milliseconds
+    t: int  # epoch milliseconds; the will has none: it is an empty message, which removes this one
     run: str  # another one at each start
     robots: tuple[str, ...] = ()  # bases of those that it carries
 

@@ -222,7 +222,7 @@ class ForwardingService(Service, ABC):
         self.post(partial(self.disconnected, side))
 
     def shut(self) -> None:
-        """Stop forwarding, as the two sides may be one broker; do the rest on the service's thread. Any thread."""
+        """Stop forwarding, on any thread: both sides may be one broker. `found_one_broker` follows on the service's."""
         if self.forwarder.gate is not Gate.SHUT:
             self.forwarder.shut()
             self.post_message(BRIDGE_PROBE, self.found_one_broker)

@@ -78,7 +78,7 @@ class SideState:
     def arrived(self) -> None:
         """Note that the retained messages of this side have arrived.
 
-        If an older value comes after them, a program has set it again.
+        From now on a value that this side had before was set again by a program, not restored by its broker.
         """
         self._went_back = False
 

@@ -1,4 +1,4 @@
-"""The pipe from the launcher to its announcer process: a socket pair on which neither side waits."""
+"""The pipe from the launcher to the announcer, which publishes for it: a socket pair on which neither side waits."""
 
 import os
 import socket

@@ -148,7 +148,7 @@ class MotorGuard:
         return earliest(self._state.due, self._hold_until)
 
     def tick(self, now: float) -> None:
-        """End a person's hold whose time is over, and publish a state that had to wait."""
+        """End the wait of scripts after a person's command once it is over, and publish a state that had to wait."""
         if self._hold_until is not None and now >= self._hold_until:
             self._hold_until = None
             self._arbiter.tick(ms(now))
@@ -163,9 +163,9 @@ class MotorGuard:
             self._state.changed(now)
 
     def save_again(self) -> None:
-        """Write the file again if the last write failed or the file was removed, and once it can be written at all.
+        """Write the file once it can be written at all; write it again if the last write failed, or it was removed.
 
-        Not while a write is still running, and not in a folder that is lost, where every write fails.
+        It is not written again while a write is still running, or in a folder that is lost, where every write fails.
         """
         if not self._can_save and self._file.can_save():
             self._can_save = True

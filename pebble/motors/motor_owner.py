@@ -154,7 +154,7 @@ class MotorOwner(Service, ABC):
             self._judge_soon(self._waiting.put_drive(drive, arrived))
 
     def is_copy(self, command: p.Drive | p.LightsSolid) -> bool:
-        """True if ``command`` is a copy of a command in a group, and this motor owner takes the group itself."""
+        """True if ``command`` is a copy from a message `c.GROUP`, and this motor owner takes that message itself."""
         return self._takes_groups and command.group is True
 
     def _receive_group(self, message: Message, _value: Any, _names: dict[str, str]) -> None:
@@ -277,7 +277,7 @@ class MotorOwner(Service, ABC):
 
     @every(_CHECK_S)
     def check_subscriptions(self) -> None:
-        """Tell operators whether an emergency stop latches here. While the broker refuses its topics, it does not.
+        """Tell operators whether a stop latches here: only if the broker grants the topics of stops and of resets.
 
         Raises TransportError while the drive topic is refused: nothing could drive this robot.
         """

@@ -1,4 +1,4 @@
-"""Reduces sound on a slow connection: first headers, then bits. Pure: times are passed in."""
+"""Reduces sound on a slow connection: first the headers, by more parts in a packet, then the bitrate. Pure."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -273,7 +273,7 @@ def files(scripts: Iterable[Script]) -> list[dict[str, object]]:
 
 
 def _first_seen(script: Script, configs: Iterable[Mapping[str, object]]) -> dict[str, object]:
-    """Return the optional fields of a script's entry: summary, first settings, and whether it was not asked yet."""
+    """Return a script entry's optional fields: summary, settings to show first, and whether it was not asked yet."""
     keys = {setting["key"] for setting in configs}
     first = {"summary": script.summary, "main": [key for key in script.main if key in keys]}
     unasked = {} if script.asked else {"asked": False}

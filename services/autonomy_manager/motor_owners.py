@@ -35,7 +35,7 @@ class MotorOwners:
         return owner in self._names or (not self._names and (owner in owners or len(owners) < _MOST))
 
     def holder_beside(self, by: str) -> str:
-        """Return the account that has control at the first owner, if it is not that of ``by``; else empty."""
+        """Return who has control at the first owner by name; empty if none has, or if the account of ``by`` has it."""
         state = self._controls[min(self._controls)] if self._controls else None
         if state is None or not state.key or state.by.partition("/")[0] == by.partition("/")[0]:
             return ""

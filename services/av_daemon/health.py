@@ -33,7 +33,7 @@ class Health:
     """The health of a device. One thread at a time writes, any reads. The delay after a failure doubles."""
 
     def __init__(self, first_delay_s: float = FIRST_DELAY_S, asked: Asked | None = None) -> None:
-        """Make a record. ``asked`` is None for a computed device, whose frames may be equal."""
+        """Make a record. ``asked``: what a device was asked for; None for a computed one, whose frames may be equal."""
         self._first_delay_s, self._asked = first_delay_s, asked
         self._check = SourceCheck(asked.rate if asked else 0.0, remembered=_REMEMBERED)
         self._doing = "starts"

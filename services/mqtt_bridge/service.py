@@ -110,7 +110,7 @@ class MqttBridge(ForwardingService):
 
     @property
     def winner(self) -> Side:
-        """Side whose retained messages count: where names are checked the local one; only the robot retains there."""
+        """Side whose retained messages count: remote; local where names are checked, as those of others are refused."""
         return Side.LOCAL if self.config.security.named else Side.REMOTE
 
     @property

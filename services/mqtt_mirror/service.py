@@ -152,7 +152,7 @@ class MqttMirror(ForwardingService):
     # -- the transports' threads
 
     def pass_stop(self, side: Side, payload: bytes) -> Iterable[bytes]:
-        """Return the payloads to pass: repetitions for one motor owner stay on the robot's own transport."""
+        """Return the payloads to pass: a stop that the bridge repeats for one motor owner stays on the local side."""
         addressed = side is Side.LOCAL and bool(payload) and codec.decode(ESTOP, payload).owner is not UNSET
         return () if addressed else (payload,)
 

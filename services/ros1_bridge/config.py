@@ -1,4 +1,4 @@
-"""The config section of a base with ROS 1, with the original's keys."""
+"""The config section of a base with ROS 1, with the keys of the original Pebble's bridge to ROS."""
 
 import os
 from collections.abc import Iterator
@@ -210,7 +210,7 @@ class Ros1(Section, frozen=True, kw_only=True):
 
 
 def _check(reader: Reader, root: Root, _: Path) -> Root:
-    """Note the keys of the original that this bridge treats otherwise."""
+    """Note the keys that the original Pebble's bridge to ROS has, and that this one treats otherwise."""
     section: Ros1 = root.services.ros1_bridge  # type: ignore[attr-defined]  # of this extension
     if not section.enabled:
         return root

@@ -1,4 +1,4 @@
-"""Telemetry of a base: its odometry, planner, diagnostics and battery, as the original's bridge has them."""
+"""Telemetry of a base: its odometry, planner, diagnostics and battery, as in the original Pebble's bridge."""
 
 from __future__ import annotations
 

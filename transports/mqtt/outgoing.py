@@ -169,7 +169,7 @@ class InFlightTable:
         return max(oldest_sent_at, self._acked_at)
 
     def unconfirmed_retained(self) -> list[Message]:
-        """Return the retained messages that the broker may not have, oldest first."""
+        """Return the retained messages whose arrival at the broker is not confirmed, oldest first."""
         return [entry.message for entry in self._unconfirmed.values()]
 
     def accept(self, message: Message) -> None:
@@ -203,7 +203,7 @@ class InFlightTable:
         return sent_at
 
     def topic_of(self, mid: int) -> str | None:
-        """Return the topic of a message of QoS 1 that is not acknowledged; None if there is no such message."""
+        """Return the topic of the unacknowledged message of QoS 1 with the id ``mid``; None if there is none."""
         return self._unacked[mid][0] if mid in self._unacked else None
 
     def first_written(self, now: float) -> dict[str, int]:
@@ -270,7 +270,7 @@ class InFlightTable:
 
     @property
     def round_trip_s(self) -> float:
-        """The shortest recent round trip: a delayed answer must not give the next stall extra time."""
+        """The shortest recent round trip: with that of a delayed answer, the next stall would be noticed too late."""
         return min(self._round_trips, default=0.0)
 
     def newest_answer(self, now: float) -> tuple[int, float]:

@@ -84,7 +84,7 @@ class BrokerDelay:
         self._pings.append(_Ping(now, now, clear))
 
     def stalled(self, since: float, now: float) -> None:
-        """Note that a ping was sent after a time without reading, in which messages may have waited at the broker."""
+        """Note that a ping was sent, and nothing read since ``since``: messages may have waited at the broker."""
         self._pings.append(_Ping(since, now, clear=True))
 
     def answered(self, now: float) -> None:

@@ -314,8 +314,8 @@ class MqttTransport(Transport):
     def _query_own(self, connection: Connection, stopping: threading.Event) -> set[str]:
         """Return the topics of our retained messages that the broker has, so that they need not be sent again.
 
-        Sets ``went_back`` if it has an older value on a topic that is not shared. All have arrived when a ping is
-        answered, because they have QoS 0.
+        Sets ``went_back`` if it has another value on a topic that only we publish on: an older one. All values have
+        arrived when a ping is answered, because they have QoS 0.
         """
         self.went_back = False
         with self._publishing:

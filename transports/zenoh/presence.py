@@ -1,4 +1,4 @@
-"""The presence of hubs and peers: a watch on their tokens and connections, and a barrier that waits for answers."""
+"""The presence of hubs and siblings, the other peers: a watch on their tokens and connections, and a barrier."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ class Barrier:
     publish. The answer carries ``retained_count()``. Siblings know this session by its token.
 
     With ``by_name`` each sibling is asked by its name, as clients of hubs elsewhere do: otherwise all other clients
-    there would answer, too (measured with 200 of them: one took 3.3 to 7.3 s to open; asking by name, 1.4 s).
+    there would answer, too (measured with 200 of them: opening a client took 3.3 to 7.3 s; by name 1.4 s).
     """
 
     def __init__(

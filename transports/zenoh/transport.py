@@ -227,7 +227,7 @@ class ZenohTransport(Transport):
         return True
 
     def _send_hello(self, session: zenoh.Session) -> bool:
-        """Store our will at the hub, and send messages until it lacks none that it has room for."""
+        """Store our will at the hub, and send our retained messages until the hub has all, or no room for the rest."""
         end = time.monotonic() + HUB_ANSWER_S
         sent: set[str] = set()
         while (remaining_s := end - time.monotonic()) > 0:  # Zenoh refuses a time limit that is not positive

@@ -123,7 +123,7 @@ def _is_zero(channel: Channel, payload: bytes) -> bool:
 
 
 def _is_group(payload: bytes) -> bool:
-    """True if the payload is a valid group. Decoding keeps the last of equal keys, so that is checked before."""
+    """True if the payload is a valid group. `_object` would keep the last of equal keys: call this before it."""
     try:
         return bool(groups.decode(payload))
     except PayloadError:

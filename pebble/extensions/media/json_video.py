@@ -21,7 +21,7 @@ _decoder = msgspec.json.Decoder(_Message)
 
 
 def pack(frame: int, keyframe: bool, captured_ms: int | None, jpeg: bytes) -> bytes:
-    """Return one message. ``jpeg``: a full picture, or a difference plus 128."""
+    """Return one message. ``jpeg``: a full picture, or 128 plus the difference from the last (jpeg_delta.py)."""
     seconds = None if captured_ms is None else captured_ms / 1000
     return _encoder.encode(_Message(frame, keyframe, zlib.compress(jpeg), seconds))
 

@@ -1,4 +1,4 @@
-"""Silent boards, which send heartbeats but no capabilities, as the original's do, and who lets pages drive them.
+"""Silent boards (heartbeats, but no capabilities: the original Pebble's), and who lets pages drive them.
 
 The config permits it, or a person with the right; that is stored until it is withdrawn, or the board publishes
 capabilities.

@@ -45,8 +45,8 @@ class Expander:
     If there are several, only the one with the smallest id works, as the announcements of all show. The broker sends
     announcements and groups to all expanders in the same order, so no group is taken apart twice. A group that comes
     long after this expander's last announcement has waited, and is dropped. Only streams are published: no state, stop
-    or command of a robot. A robot may send its groups on a short topic, to save bytes; while two robots claim the same
-    one, groups there are dropped.
+    or command of a robot. A robot's state ``wire`` may name a short topic for its groups; while two robots name the
+    same, groups there are dropped.
     """
 
     def __init__(self, transport: Transport, clock: Callable[[], float] = time.monotonic, id_: str = "") -> None:

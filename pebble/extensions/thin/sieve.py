@@ -21,7 +21,7 @@ OVERDUE_S = 10.0  # a message that has waited for so long gives way no more
 
 
 class Rank(IntEnum):
-    """The rank of a message: rank N may fill the link's room N times. Streams have the lowest, so they wait first."""
+    """The rank of a message: rank N is sent until N times the link's room is in use. Streams wait first."""
 
     STREAM = 1
     STATE = 2

@@ -121,7 +121,7 @@ class Action:
 
 
 def shorten(file: int) -> None:
-    """Cut a file to its end if it is long, while a program may append to it."""
+    """Delete all but the end of the open file ``file`` if it is long; a program may append to it meanwhile."""
     size = os.fstat(file).st_size
     if size > _MOST:
         with suppress(OSError):  # a full disk

@@ -9,7 +9,7 @@ from pebble.transports import Subscription
 
 
 class AliasUse:
-    """The aliases in use. ``begin`` starts to use an alias and returns its subscription, if any; ``end`` ends that."""
+    """The aliases in use. ``begin`` starts to use an alias and returns its subscription, if any; ``end`` ends use."""
 
     def __init__(
         self,

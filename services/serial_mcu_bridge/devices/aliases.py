@@ -54,7 +54,7 @@ def claims(manifest: McuManifest, lookup: Lookup = c.channel_of) -> Claims:
 
 
 def outlet_feature(claim: str) -> set[str]:
-    """Return the feature that the robot has while ``claim`` is in use: an outlet's topic; empty for other claims."""
+    """Return the feature of a robot while ``claim`` is in use, such as ``outlets/o1/status``; empty for others."""
     return {claim.partition("/")[2]} if c.channel_of(claim) in (c.OUTLET_STATUS, c.OUTLET_COMMAND) else set()
 
 

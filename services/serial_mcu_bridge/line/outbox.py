@@ -30,7 +30,7 @@ class Outbox:
         self._place(_DRIVE, _Waiting(self._stop, float("inf")))
 
     def put(self, kind: str, line: bytes) -> None:
-        """Add a line of another kind, such as ``put("lights", …)``. It never expires."""
+        """Add a line of any kind but drive lines, such as ``put("lights", …)``. It never expires."""
         self._place(kind, _Waiting(line, float("inf")))
 
     def take(self, now: float) -> bytes | None:

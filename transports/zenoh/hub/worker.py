@@ -163,7 +163,7 @@ class HubWorker:
             query.reply(wire.asked(wire.HELLO, account), wire.encode(lacking))
 
     def _end_predecessor(self, hello: wire.Hello) -> None:
-        """Publish a restarted client's former will now, unless the client has published on its topic since."""
+        """Publish the will that a client left before its restart, unless the client retains a value on that topic."""
         if hello.will is None:
             return
         for name in self._store.wills() - {hello.name}:

@@ -31,11 +31,11 @@ def robot_account(
     level: SecurityLevel = "open",
     reads: str = "",
 ) -> Iterator[CheckResult]:
-    """Publish probe messages below ``base`` and check that the broker delivers them.
+    """Publish probe messages below ``base`` and check that the broker accepts them.
 
-    No program takes a probe for anything else. One that does not come back within ``answer_s`` counts as lost. Above
-    the level ``open``, a probe in the name of another robot must be lost. ``reads``: a further filter that the broker
-    must grant; with it, the probe must also come back.
+    No program takes a probe for anything else. With MQTT 3.1.1, which tells no refusal, a probe must come back within
+    ``answer_s``; with MQTT 5 only if ``reads`` is given, a further filter that the broker must grant. Above the level
+    ``open``, a probe in the name of another robot must not come back.
     """
     try:
         with reached(settings, "") as trial:

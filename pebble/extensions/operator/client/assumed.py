@@ -1,4 +1,4 @@
-"""The capabilities assumed for a silent board, such as the original's that drive without saying so. Pure."""
+"""The capabilities assumed for a board that publishes none, such as the original Pebble's boards. Pure."""
 
 from collections.abc import Collection
 from typing import Any, Final, Literal

@@ -133,7 +133,7 @@ def words(
 def person(by: str, *, login: bool = True) -> str:
     """Return the sender ``by`` in words for people.
 
-    A server without logins calls its user ``local``, and may add the device. ``login`` False: it is this server.
+    A server without logins calls its user ``local``, and may add the device. ``login`` False: this server has none.
     """
     if by.partition(" ")[0] != "local":
         return by

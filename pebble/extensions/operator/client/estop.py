@@ -209,7 +209,7 @@ class RobotStop:
         return state is not None and self._order.name in state.recent
 
     def _has_taken_it(self, owner: str) -> bool:
-        """True if the owner has listed this stop since its last start, even if it lists only later ones by now."""
+        """True if the owner has listed this stop and not restarted since, even if it now lists only later stops."""
         state = self.estop.states.get(owner)
         return state is not None and self._boots.get(owner) == state.boot
 
@@ -221,7 +221,7 @@ class StopSender:
     again afterwards and at ``due``. Times are seconds of one monotonic clock. With ``hold`` it never gets too old.
 
     A stop of all robots is sent to each robot that publishes anything. To those in ``robots`` it is repeated until they
-    confirm it. Messages of robots for which there is no room in ``robots`` count as ``omitted``.
+    confirm it. ``omitted`` counts messages of robots for which ``robots`` has no room.
     """
 
     def __init__(
@@ -270,7 +270,7 @@ class StopSender:
 
     @property
     def confirmed(self) -> bool:
-        """True if at least one robot is stopped, and every other one too, except components that do not drive."""
+        """True if at least one robot is stopped, and so are all others, except components that do not drive."""
         progress = {robot.progress for robot in self.robots.values()}
         return Progress.CONFIRMED in progress and progress <= {Progress.CONFIRMED, Progress.SPARED} and not self.omitted
 

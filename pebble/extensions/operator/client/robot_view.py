@@ -193,7 +193,7 @@ class RobotView:
                 self.parked = self.parked and codec.decode(c.DRIVE, message.payload).moves
 
     def _keep_for_late_stop(self, message: Message) -> None:
-        """Keep the topic's newest message, as an emergency stop that begins later starts with all of them.
+        """Keep the topic's newest message: an emergency stop that begins later starts with all kept messages.
 
         Capabilities have a place even after MAX_REMEMBERED states of owners.
         """

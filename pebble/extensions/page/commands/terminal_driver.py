@@ -32,8 +32,8 @@ _AXES = {
 class TerminalDriver:
     """A person at a terminal. Pass messages to :meth:`receive`, keys to :meth:`press`; publish what is returned.
 
-    ``heartbeat``: whether the robot sends one on this connection. ``assume``: it is a board that drives without saying
-    so. Times are seconds of a monotonic clock that also counts while the machine is suspended.
+    ``heartbeat``: whether the robot sends one on this connection. ``assume``: a robot without capabilities counts as
+    one that drives. Times are seconds of a monotonic clock that also counts while the machine is suspended.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class TerminalDriver:
         return "" if self.stop is None or self.stop.confirmed else self.stop.robots[self.robot.base].why
 
     def status(self) -> str:
-        """Return the status line: the command sent, or why none is sent. Parts of it come from others."""
+        """Return the status line: the command sent, or why none is sent, with texts of the robot and other persons."""
         view, robot = self._driven.shown(self._tab, self._ticked_at), self.robot
         x, z, _ = self._wanted(self._ticked_at)
         motion = self._reason or ("let go first" if self._pressed else "ready")

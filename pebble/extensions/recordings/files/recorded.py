@@ -89,7 +89,7 @@ class Damage:
 
 
 def finished_path(path: Path) -> Path:
-    """Return the path of a ``.mcap.active`` file once it is finished."""
+    """Return the path that a ``.mcap.active`` file has once it is finished."""
     return path.with_name(path.name.removesuffix(ACTIVE) + SUFFIX)
 
 

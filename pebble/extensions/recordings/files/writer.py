@@ -81,8 +81,8 @@ class RecordingWriter:
     def flush(self) -> None:
         """Write all that was added to the file.
 
-        The package declares a channel once, in a chunk, which damage may destroy: so each is also declared before that
-        chunk, and all of them again once a minute.
+        The package ``mcap`` declares a channel once, inside a chunk, which damage may destroy. So new channels are also
+        declared before their chunk, and all channels again once a minute.
         """
         self._named += self._new
         named, self._new = self._new, []

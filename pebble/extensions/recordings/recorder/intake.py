@@ -75,7 +75,7 @@ class Intake:
             self._counters["dropped"] += messages
 
     def add_order(self, topic: str, source: str) -> None:
-        """Add an order to the writer, in its place between the messages; ``topic`` names it."""
+        """Add a request to the writer, such as FORGET: its ``topic``. It keeps its place among the messages."""
         self._events.append(Item(self._boot_ns(), topic, b"", None, None, "", source))
 
     def take(self) -> list[Item]:

@@ -15,7 +15,7 @@ ADDRESS: Final = ("10.0.0.42", "255.255.255.0", "10.0.0.1", "10.0.0.53")  # own,
 class Radio:
     """The station of one board. ``lose`` and ``restore`` move its access point; the firmware uses the rest.
 
-    ``rejoins``: the driver joins again by itself, as both ports do by default.
+    ``rejoins``: the driver joins again by itself, as MicroPython does on ESP32 and ESP8266 by default.
     """
 
     def __init__(self, now: Callable[[], float], platform: Platform) -> None:
