@@ -135,10 +135,10 @@ class Audit(Observer):
         self.note("stop-not-confirmed", owner=owner, stop=str(stop.stop))
 
     def _noted_before(self, row: Row, who: str) -> bool:
-        """True if this sender's stop already has a row, or lights that go on; else remember it.
+        """True if the log tells this already: the stop has a row, or the sender's lights have blinked like this.
 
-        A stop may arrive twice, with an account and without; the two count as different senders. Lights that blink are
-        one row on and one off, until they rest for a minute.
+        If not, remember it. A stop may arrive twice, with an account and without: from two senders. Lights that blink
+        have one row on and one off, until they rest for a minute.
         """
         if row["what"] == "lights":
             key, now = (who, row["on"]), self._clock()
