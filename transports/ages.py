@@ -42,7 +42,7 @@ class _Clock:
         self.began = self.received_at = now
         self.newest = sent  # the newest stamp
         self.least = now - sent  # the difference of the fastest message
-        self.proved = -inf  # a message without any delay has at least this difference
+        self.proved = -inf  # without any delay the difference is at least this, by messages that came in time
         self.patience_s = patience_s
         self.other: _Clock | None = None  # the clock if it was changed, and the messages since then were not late
 
@@ -76,8 +76,8 @@ class SenderClocks(Generic[K]):
     def age_s(self, key: K, sent: float, waited_s: float, now: float, late_s: float) -> float:
         """Return the seconds that a message stamped ``sent`` has waited at ``now``; learn the sender's clock from it.
 
-        A message that has waited for more than ``late_s`` is late. ``waited_s``: the longest time that the message can
-        have waited, by other evidence. Until the clock is two seconds old, no smaller age is returned.
+        A message that has waited for more than ``late_s`` is late. ``waited_s``: the most that it can have waited, by
+        other evidence; if that is in time, it proves a difference. A clock younger than two seconds returns no less.
         """
         with self._lock:
             clock = self._clocks.get(key)
@@ -89,7 +89,7 @@ class SenderClocks(Generic[K]):
                 clock = self._clock_to_use(key, clock, sent, now, late_s)
             if waited_s <= late_s:
                 clock.proved = max(clock.proved, now - sent - waited_s)
-            # The difference without delay is between `proved` and `least`. The smaller makes an age rather too long.
+            # Without delay the difference is from `proved` to `least`. With the smaller, ages are rather too long.
             age = now - sent - min(clock.least, clock.proved)
             return age if now - clock.began >= _YOUNG_S else max(age, waited_s)
 

@@ -194,8 +194,8 @@ class Connection:
     def _wait(self, timeout: float) -> tuple[bool, float]:
         """Return whether the socket is readable, and the time when this was known.
 
-        Bytes that are already in the socket have come at an unknown time, unless it was empty just before. So it is
-        first polled without a wait, unless it was found empty a moment ago. Each time when it is empty is noted.
+        Bytes that are already in the socket have come at an unknown time. So it is polled without a wait first, unless
+        it was found empty a moment ago: what comes after that has just come. ``waiting`` notes when it was empty.
         """
         if not self._poll.registered:
             with self._lock:
@@ -232,7 +232,7 @@ class Connection:
         """Send TCP's ACKs at once: a broker with Nagle's algorithm delays its next message until then (up to 40 ms).
 
         The kernel falls back to delayed ACKs whenever we send, so this is called after every read, unless MQTT's own
-        acknowledgements follow and carry TCP's.
+        acknowledgements follow and carry TCP's. On a thin link the next one waits for those, see `_ONCE`.
         """
         sock = self._client.socket
         if _QUICKACK is not None and sock is not None:

@@ -253,8 +253,8 @@ class MqttTransport(Transport):
         tried_at = time.monotonic() + _TRIED_S  # a connection that ends before that shows no limits
         try:
             self._synchronize(connection, run.stopping)
-            if failed := self._dialler.addresses.succeeded():
-                self._log(logging.INFO, f"connected to {connection.where}; before it {failed}")
+            if earlier_failures := self._dialler.addresses.succeeded():
+                self._log(logging.INFO, f"connected to {connection.where}; before it {earlier_failures}")
             while not run.stopping.is_set():
                 connection.pump(_IDLE_S, self._deliver_all)
                 if run.renewal:
@@ -321,14 +321,14 @@ class MqttTransport(Transport):
         with self._publishing:
             messages = {topic: message for topic, message in self._own.items() if topic not in self._own.pending}
             not_accepted = {topic for topic, message in messages.items() if not self._accepts(connection, message)}
-            may_differ = self._own.shared | not_accepted
+            may_differ = self._own.shared | not_accepted  # others publish there, or ours is refused
         retained = self._find(connection, list(messages), stopping)
         if self.will is not None and retained.get(self.will.topic) == self.will.payload:
             del retained[self.will.topic]  # our own will, published although we were running
         differing = {topic for topic, payload in retained.items() if payload != messages[topic].payload}
         older = differing - may_differ
         self.went_back = bool(older)
-        return retained.keys() - older
+        return retained.keys() - older  # with those that may differ: there ours is not sent again
 
     def _find(self, connection: Connection, topics: list[str], stopping: threading.Event) -> dict[str, bytes]:
         """Return the payloads that the broker retains on these topics."""
@@ -375,7 +375,7 @@ class MqttTransport(Transport):
         subscriptions = self._subscriptions
         for message in messages:
             self.count_received()
-            repeat = False
+            repeat = False  # True: it was delivered before, and came again because we subscribed again
             if message.retain and self.as_published:
                 if self._own_message_filter.is_echo(message):
                     self.counters.add("echoes")

@@ -148,8 +148,8 @@ class ZenohTransport(Transport):
         try:
             if will is not None:
                 self._send(will, False)
-                self._hub.leave(session)
-            self._synchronize(GOODBYE_S)  # when they answer, they have received our last messages
+                self._hub.leave(session)  # or else it would publish the will once more
+            self._synchronize(GOODBYE_S)  # siblings and hub have received our last messages when they answer
         except zenoh.ZError as error:
             log.warning("%s could not close in order: %s", self.client_id, error)
         finally:
@@ -202,7 +202,7 @@ class ZenohTransport(Transport):
         """Process a change of hubs or connections; return the serial number of the working hub connection, 0 for none.
 
         The number grows with each hub that appears. ``linked``: the result of the last call, or 0 after an error;
-        ``seen``: the version of that call's view. If ``view`` still has it, this is another try after a failed one.
+        ``seen``: the version of that call's view. If ``view`` is of the same version, only a failed try is repeated.
         """
         if not view.hubs:
             self.problem = f"the hub of {self.settings.run_dir} is away"
@@ -210,7 +210,7 @@ class ZenohTransport(Transport):
             return 0
         if view.connection != linked:
             return view.connection if self._connect_hub() else 0
-        if view.version != seen:
+        if view.version != seen:  # the same hub, but a connection was interrupted, or a hub ended
             self._refresh()
         return linked
 
@@ -248,8 +248,8 @@ class ZenohTransport(Transport):
         """
         with self._publishing:
             owed = bool(self._own.pending or lacking)
-            self._sync_retained(self._own.keys() - lacking)
-            self._hub.put_removals(session, lacking)
+            self._sync_retained(self._own.keys() - lacking)  # sends all but these
+            self._hub.put_removals(session, lacking)  # it may lack removals, too
             return owed
 
     def _refresh(self) -> None:
