@@ -209,14 +209,14 @@ class Forwarder:
     def _receive_named(self, source: SideState, names: Names, message: Message) -> Routed:
         """Forward a message whose sender is checked: the name moves from the topic into the payload."""
         sender = names[message.topic]
-        subject, by = sender.subject, sender.account  # sign() may add to this the person for whom the account acts
+        subject, by = sender.subject, sender.account  # Signed, below, has the person for whom it acts, too
         outcome = self.admit(source, subject, message, sender.topic, by != NO_ACCOUNT)
         if subject is None:
             outcome = sender.foreign  # why the topic means nothing to this robot
         elif isinstance(outcome, Forward):
             match names.sign(sender, message):
                 case Signed(signed, by) if by != NO_ACCOUNT and subject.kind is Kind.FLAG:
-                    outcome = self.retained.change(subject, signed)  # both sides have flags on topics without names
+                    outcome = self.retained.change(subject, signed)  # the topic without a name gets it on both sides
                 case Signed(signed, by):
                     outcome = self.pass_on(source, subject, signed, outcome, sender.account)
                 case Drop.UNNAMED if outcome.retain:  # it may be a retained message of the robot itself
@@ -316,7 +316,7 @@ class Forwarder:
         """Return an admitted message as it may pass, or why not: it is too late, or a script elsewhere sent it."""
         if subject.kind.one_shot and self._is_late(subject, message, forward, account):
             return Drop.LATE
-        if not forward.unsigned:
+        if not forward.unsigned:  # it may have a script's signature
             return message
         return self._without_script(source, message) or Drop.SIGNED
 
@@ -372,7 +372,7 @@ class Forwarder:
             case Finding.RELAY:
                 relayed = Forward(forward.qos, False, forward.urgent)
                 self.publisher.publish(self.sides[side.other], subject, message, relayed)
-        return Drop.PROBE
+        return Drop.PROBE  # also for RELAY: it has been sent on here
 
     def _hold_event(self, target: SideState, message: Message) -> Drop:
         if self.gate is Gate.SHUT:

@@ -69,7 +69,7 @@ class Publisher:
         topic, payload = message.topic, message.payload
         if (source.side, topic) in self._cycles.closed_ways and source.returns.is_echo(topic, payload):
             return True
-        # Next, from the broker to which it was published: retained ones are recognised by their values instead.
+        # `loopback` is of the broker that it was published to. Retained ones are recognised by their values instead.
         if source.transport.exact_echo or message.retain or not subject.is_two_way:
             return False
         return source.loopback.is_echo(topic, payload)

@@ -133,10 +133,10 @@ def _qos(subject: Subject, message: Message) -> QoS:
 
 
 def _retain(subject: Subject, message: Message) -> bool:
-    """True if a message is to be retained: flags always; others as published or, if that is hidden, as the channel."""
+    """True if a message is to be retained: as it was published or, where that is hidden, as its channel says."""
     if subject.kind.one_shot:
         return False
-    if subject.kind is Kind.FLAG and subject.retain:
+    if subject.kind is Kind.FLAG and subject.retain:  # however it was published
         return True
     if message.retain or message.retain_requested:
         return True

@@ -63,10 +63,10 @@ class SideState:
             self.restarted = True
             self._lost_at = self._clock()
             # A broker that ended may restore a save. Noted now: its retained messages may come before CONNECTED does.
-            # A side that wins is doubted only once the transport has found older values there.
+            # Of the side that wins it is noted at CONNECTED, and only if the transport has found older values there.
             self._went_back = not self._wins and self.transport.was_ended
         elif self._wins:
-            self._went_back = self._was_brief and self.transport.went_back  # if longer, an operator may have set them
+            self._went_back = self._was_brief and self.transport.went_back  # else an operator may have set them
 
     @property
     def has_gone_back(self) -> bool:
