@@ -108,11 +108,11 @@ class PassedStops:
             first = self._passed.setdefault(name, now)
             if len(self._passed) > NAMES:
                 del self._passed[next(iter(self._passed))]
-            waiting = {key for key, owner in self._owners.items() if _waits(owner, name)}  # may not have it yet
+            waiting = {key for key, owner in self._owners.items() if _waits(owner, name)}  # owners without it, perhaps
             reset_since = {key for key, owner in self._owners.items() if owner.freed_at > first} - waiting
-            if reset_since:  # the stop is a repetition: for the others it was noted as pending when it came first
+            if reset_since:  # a repetition, noted as pending when it came first: the other owners get a copy
                 return [_addressed(stop, key) for key in self._owners if key not in reset_since]
-            for key, owner in self._owners.items():  # for each the newest stop stays pending
+            for key, owner in self._owners.items():  # the newest stop of each stays pending
                 has_newer = owner.pending is not None and owner.pending.first > first
                 if key not in waiting and not has_newer and not owner.confirms(name):
                     owner.pending = Pending(stop, first, now)

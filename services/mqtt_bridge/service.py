@@ -416,10 +416,10 @@ class MqttBridge(ForwardingService):
             self.refusals.stale("a command" if channel is None else channel.metric)
             return
         if isinstance(routed.outcome, Drop) and (routed.outcome in _IGNORED or not is_local):
-            return
+            return  # of what is not forwarded, only requests of the robot's programs count
         if channel is None or codec.is_blank(message.payload):
             return
-        if not message.retain and routed.outcome is not Drop.KNOWN:  # else it brings nothing new
+        if not message.retain and routed.outcome is not Drop.KNOWN:  # observers see what is new
             # With a closed gate both sides may be one broker, and the message an operator's.
             by_robot = is_local and self.forwarder.gate is Gate.OPEN
             self._observers.passed(channel, ROBOT if by_robot else routed.by, message.payload)

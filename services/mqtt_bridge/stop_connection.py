@@ -158,7 +158,7 @@ class StopConnection:
     def main_lost(self, *, ended: bool) -> None:
         """Note that the main connection is lost; ``ended``: the broker has closed it."""
         self._copies.forget()
-        if self._clock() - self._connected_at >= _KICKED_S:
+        if self._clock() - self._connected_at >= _KICKED_S:  # this one is not why it was lost
             self._kicks = 0
         elif ended and self.listens:
             self._kicks += 1
@@ -194,7 +194,7 @@ class StopConnection:
         if state is State.CONNECTED:
             self._connected_at = self._clock()
             return
-        doubtful = self._copies.lost()
+        doubtful = self._copies.lost()  # taken for copies, but they may have come over the main connection alone
         if state is State.CONNECTING:  # it was lost; if it is CLOSED, we have ended it
             for message in doubtful:
                 self._pass_on(message)
