@@ -159,7 +159,7 @@ def _config(
     file_class, config_class, rules = _classes(installed)
     reader = Reader(folder, env, rules, notes, file=path, other_forms=True)
     merged = with_instances(written)
-    unused = extensions.keys_of_missing(installed)  # keys that no class has: they would be unknown keys
+    unused = extensions.keys_of_missing(installed)  # else they would be unknown keys, as no class has them
     if core_only:
         unused += [key for extension in available for key in extension.sections]
     root = reader.section(file_class, without(merged, unused))

@@ -143,7 +143,7 @@ class Reader:
         return Secret(value) if _extra(metas, "secret") else self._parsed(metas, value, path)
 
     def _otherwise(self, annotation: Any, raw: Any, path: problems.Path, default: Any) -> Any:
-        """Return the value to use for ``raw``, which the key does not accept; note it unless only the form differs."""
+        """Return the value to use for a refused ``raw``, or _WRONG. Note it unless the value differs only in form."""
         kind, metas = unwrap(annotation)
         shown = "a value of another kind" if _extra(metas, "secret") else _shown(raw)
         tells_nothing = shown == "text" and (get_origin(kind) is Literal or kind in (str, Path))
@@ -155,7 +155,7 @@ class Reader:
             self.notes.warning(path, f"{must_be}; {used}")
             return reading.value
         is_raw = reading is not None and type(reading.value) is type(raw) and reading.value == raw
-        if reading is None or is_raw:  # raw was refused before this call, and would be again
+        if reading is None or is_raw:  # there is nothing but raw, which would be refused again
             self.notes.problem(path, must_be)
             return _WRONG
         return self._plain(annotation, reading.value, path, NODEFAULT)

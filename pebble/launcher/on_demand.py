@@ -69,7 +69,7 @@ class OnDemand:
 
     def ended(self, program: Program) -> None:
         """Note the end of a program. What it has requested runs for OUTLIVE_S longer, and what it holds runs again."""
-        if not program.may_request:
+        if not program.may_request:  # only the bridge may: all that is requested or held here is so by the same program
             return
         no_longer_held, self._held = self._held, {}
         for name in no_longer_held:

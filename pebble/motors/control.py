@@ -46,7 +46,7 @@ class Control:
         self.lease = lease_of(owner, owners, self.boot, ms(now), operator.sub, secrets.token_hex, strangers)
         self.lease.vouched = (ms(now), ms(now)) if bridged else None
         self._turns = Paced(show_turn, _TURNS_PER_S)
-        self._turn_due = now if self.peers else None  # when the turn is sent again
+        self._turn_due = now if self.peers else None  # when the grant of control, the turn, is sent again
         self._state = Paced(lambda: publish(self.state()))
         self._log = RateLimitedLog(log, burst=5)
         self._tick_due: float | None = None  # when the lease must be ticked next
@@ -129,7 +129,7 @@ class Control:
             lease.changed = False
             self._state.changed(now)
             self._turn_due = now if self.peers else None
-        if self._tick_due is None and (lease.key or lease.others):
+        if self._tick_due is None and (lease.key or lease.others):  # `tick` ends both when their time is over
             self._tick_due = now + _TICK_S
         halts, lease.halts = lease.halts, False
         if halts:

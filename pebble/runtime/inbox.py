@@ -27,9 +27,9 @@ class Inbox:
         self._lock = threading.RLock()
         self._wakeup = Wakeup()
         self._jobs: OrderedDict[Hashable, Job] = OrderedDict()  # by name, or by a number if a job has none
-        self._internal: deque[Job] = deque()
+        self._internal: deque[Job] = deque()  # of :meth:`post_internal`: first, and never dropped
         self._numbers = count()
-        self._woken = False
+        self._woken = False  # by :meth:`wake`, since the last wait
         self.dropped = 0
 
     def post(self, job: Job, *, newest_of: Hashable = None, last_of: Hashable = None) -> None:
@@ -76,7 +76,7 @@ class Inbox:
         """Remove and return the next job, waiting up to ``timeout`` seconds; None if there was none, or on `wake`."""
         if timeout != 0.0:
             self.wait(timeout)
-        if self._internal:
+        if self._internal:  # only this thread takes, so that no lock is needed
             return self._internal.popleft()
         with self._lock:
             return self._jobs.popitem(last=False)[1] if self._jobs else None
