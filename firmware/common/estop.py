@@ -120,7 +120,7 @@ class EmergencyStop:
             _, asks_id, asks, _ = lease.asker or ("", "", "", "")
             others, named = json.dumps(lease.others), json.dumps(self.names is not None)
             return (_HOLDER % (by, name, lease.key, device, asks, asks_id, others, named, self.latch.boot)).encode()
-        state = self.latch.state(self._saved == self.latch.latched if self._saves else None)
+        state = self.latch.state(self._saved == self.latch.latched if self._saves else None)  # as `persisted`
         if self.arbiter.barred:
             state["barred"] = self.arbiter.barred
         text = _json(state)

@@ -75,7 +75,7 @@ class Robot:
         self._sensors = [ADC(Pin(pin)) for pin in pins.SENSORS]
         self._charge = Pin(pins.CHARGE, Pin.IN, Pin.PULL_DOWN)
         self._sensors_grid, self._fade_grid = Grid(_SENSORS_MS, now), Grid(_FADE_MS, now)
-        self._level = -1
+        self._level = -1  # the light's brightness as set last; -1: set it in any case
         self.lines.put(b"Starting setup...")
         self.lines.put(b"Done!")
 
@@ -115,7 +115,7 @@ class Robot:
             self.light.glow(blue, green, red)
         else:
             self.light.flash(blue, green, red, numbers[3], self._now)
-        self._level = -1
+        self._level = -1  # the colour is new, even if the brightness is not
         self._shine(self._now)
 
     def _shine(self, now: int) -> None:

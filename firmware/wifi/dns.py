@@ -23,7 +23,7 @@ def answer(data: bytes, asked: bytes, skip: int = 0) -> str | None:
         return None
     if data[2] & 0xF8 != 0x80 or data[4:6] != b"\0\1":  # not a response to a standard query of one question
         return None
-    # Aliases (CNAME) come before their addresses. There is none if there is no such name, or if the server has trouble
+    # Aliases (CNAME) come first, then their addresses: none for an unknown name, or if the server has trouble
     addresses: list[bytes] = []
     for _ in range(data[6] << 8 | data[7]):
         while at < len(data) and 0 < data[at] < 64:  # a name: labels, then 0 or, above 63, where the rest is

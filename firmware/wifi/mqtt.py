@@ -96,8 +96,8 @@ class Client:
         """Acknowledge a publication, even one too long to be stored: else the broker holds back the next ones."""
         data = self.data
         topic = at + 2 + (data[at] << 8 | data[at + 1]) if stop - at > 1 else stop + 1  # the topic's end
-        body = topic + (first & 6)  # with QoS 1, whose bit is a 2, the packet id of 2 bytes is between them
-        if first & 4 or body > stop or body > self._end:
+        body = topic + (first & 6)  # the payload; QoS 1 sets the bit of 2, and puts a packet id of 2 bytes before it
+        if first & 4 or body > stop or body > self._end:  # QoS above 1, or cut off
             raise ValueError("publication")
         if body > topic:
             out, end = self.out, self.waiting

@@ -49,15 +49,15 @@ class NetworkRobot:
         self._wifi = Wifi(get(settings, "wifi", "ssid"), get(settings, "wifi", "password", ""))
         self._clock = Clock(settings.get("ntp", "pool.ntp.org"), now)
         names = None
-        if ("open", "login", "named").index(get(settings, "security", "level", "open")) == 2:  # ValueError for others
+        if ("open", "login", "named").index(get(settings, "security", "level", "open")) == 2:  # named; or ValueError
             from common import names  # type: ignore[assignment]
-        words = "drive", "free", "refuse"
+        words = "drive", "free", "refuse"  # numbered as in `Lease`; without a setting refuse at level named, else free
         strangers = words.index(get(settings, "security", "strangers", words[2 if names else 1]))
         topics = b"estop", b"drive-values", b"control", b"control/take", b"estop-reset"
         if hasattr(body, "groups"):
             topics += (b"group",)
         plain = len(topics)  # so many are subscribed to without an account
-        if names:  # clients without one may stop, and send zeros; those that may drive may also have control
+        if names:  # without one: stops and zeros, if strangers are refused (2); else they may drive, and have control
             plain = _DRIVE + 1 if strangers == 2 else _CONTROL + 1
         self.session = Session(settings, root, topics, plain, names, wrap, self._take)
         self.stops = EmergencyStop(now, _DRIVE_LIMIT_MS, strangers, names)
