@@ -80,7 +80,7 @@ class DescribedBridge(SerialService):
         self._session = Session(self.config.base)
         self.watchdog = ImuWatchdog(self.options, self.instance)
         self._peers = PeerDevices()
-        self._token = secrets.token_hex(8)  # of our question about our uid; with another it is a second device's
+        self._token = secrets.token_hex(8)  # of our _UID_QUERY; one for our uid with another token is a second device's
         self._conflict_logged = False  # another device has the same uid
         self.device: Device | None = None
         self._published_states: dict[int, tuple[Reading, int]] = {}  # newest of each state interface, its epoch ms
@@ -226,8 +226,8 @@ class DescribedBridge(SerialService):
         self._listen_generic(device, private=False)  # a reader of the manifest may send commands at once
         self.publish(MCU_LOCAL_ONLY, device.local_only, uid=device.uid)
         self.publish(MCU_DESCRIBE, device.payload, uid=device.uid)
-        self.publish(MCU_COMMAND, {"from": self._token}, uid=device.uid, name=RESERVED)  # a _UID_QUERY
-        self._listen_generic(device, private=True)  # not before: bridges must know that these stay on the robot
+        self.publish(MCU_COMMAND, {"from": self._token}, uid=device.uid, name=RESERVED)  # a _UID_QUERY, with a token
+        self._listen_generic(device, private=True)  # only now, as bridges have been told that these stay here
         self.aliases.announce(device)
         self.call_at(self.clock() + CLAIM_S, partial(self.aliases.permit, device))
 

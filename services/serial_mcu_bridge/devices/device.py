@@ -119,10 +119,11 @@ class Device:
         if interface.direction is Direction.IN:
             return interface
         channel = c.channel_of(f"{c.OUTGOING}/{interface.channel}")
-        family = f"{self._addresses.base}/{c.OUTGOING}/"
-        if channel not in (c.IMU_FAST, c.IMU) or not self._addresses[channel].topic.startswith(family):
+        outgoing = f"{self._addresses.base}/{c.OUTGOING}/"
+        # Of the robot's channels that an MCU may use, only these have a key in the config.
+        if channel not in (c.IMU_FAST, c.IMU) or not self._addresses[channel].topic.startswith(outgoing):
             return interface
-        return replace(interface, channel=self._addresses[channel].topic.removeprefix(family))
+        return replace(interface, channel=self._addresses[channel].topic.removeprefix(outgoing))
 
     def _robots_channel(self, suffix: str) -> c.Channel | None:
         """Return the robot's channel at ``suffix``, by the config or else by the contract; None if there is none."""
