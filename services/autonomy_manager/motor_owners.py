@@ -86,10 +86,10 @@ class MotorOwners:
             boot, count, barred = baseline.setdefault(owner, (state.boot, state.count, 0))
             if state.latched or (state.boot == boot and state.count != count):
                 return _stopped(owner, state)
-            # An owner bars all runs up to a number: those before one that begins, or all because a person drives.
+            # An owner bars all runs up to a number: that before a run that begins, or the newest as a person drives.
             is_barred = state.last_barred != barred and not newer(run, state.last_barred)
             if signs and is_barred:
-                newer_began = state.last_barred != run or newer(self.newest_run, run)
+                newer_began = state.last_barred != run or newer(self.newest_run, run)  # != : a later one
                 return SUPERSEDED if newer_began else OVERRIDDEN
             if state.boot != boot:
                 return f"motor owner {owner} was restarted: start the script again"

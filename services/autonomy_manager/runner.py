@@ -169,7 +169,7 @@ class Runner:
             command=(*script.command, "--config", path, *step.options),
             folder=script.folder,
             environment=environment(script.environment, variables, ours=script.ours),
-            tie=signal.SIGTERM if script.ours else signal.SIGKILL,
+            tie=signal.SIGTERM if script.ours else signal.SIGKILL,  # if this process dies: ours then end in order
         )
         part: Part
 
