@@ -118,7 +118,7 @@ class OpenComponents:
                             failed.add(filter_)
                             log.warning("%s is not received: %s", filter_, error)
                 if wanted and self._broker.connected:
-                    self._show_flags(ref, self._flags.get(ref, FlagsView()))  # those that are not set do not arrive
+                    self._show_flags(ref, self._flags.get(ref, FlagsView()))  # even if none arrived: none is set
                 if not wanted:
                     if ref in self._pages:  # opened again meanwhile
                         continue

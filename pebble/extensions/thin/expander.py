@@ -124,7 +124,7 @@ class Expander:
             robot.named = wire.named
             short = wire.short if isinstance(wire.short, str) else ""
             if short != robot.short:
-                robot.short, robot.short_at = short, -inf
+                robot.short, robot.short_at = short, -inf  # no group has come there yet
             if isinstance(wire.dict_id, int) and isinstance(wire.dict, str):
                 others = [entry for entry in robot.dictionaries.items() if entry[0] != wire.dict_id]
                 newest = (wire.dict_id, wire.dict.encode())

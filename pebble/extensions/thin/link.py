@@ -101,7 +101,7 @@ class LinkMeter:
         self._rise_s = {level: rule.rise_s for level, rule in _RULES.items()}  # time without a queue before a rise
         self._rests_since: float | None = None  # since when there is no queue
         self._risen_at = -inf
-        self._crowd = Crowd()
+        self._crowd = Crowd()  # tells whether a queue stands now
 
     @property
     def crowded(self) -> bool:

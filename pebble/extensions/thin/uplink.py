@@ -137,19 +137,19 @@ class ThinUplink(Uplink):
         self._meter, self._room = LinkMeter(section.link.profile, section.link.kbit), Room(section.link.kbit)
         self._report = LinkReport(self._meter, addresses[LINK], remote)
         self._guard = threading.Lock()  # of the room: messages take it on the thread that received them
-        gate = install_gate(config, addresses, forwarder, self.note_drive)
-        self._sieve = Sieve(self._takes, forwarder.counters, clock)
+        gate = install_gate(config, addresses, forwarder, self.note_drive)  # None if the robot takes no groups
+        self._sieve = Sieve(self._takes, forwarder.counters, clock)  # keeps what finds no room
         self._groups: StreamGroups | None = None
         if section.link.group_hz:
             self.channels = (LINK, WIRE)
             self._groups = StreamGroups(config, addresses, remote, forwarder.counters, clock)
-        self._sifter = Sifter(forwarder, gate or forwarder, self._groups)
+        self._sifter = Sifter(forwarder, gate or forwarder, self._groups)  # leads messages to the sieve, or to groups
         self._late, self._hold = LateRun(), MediaHold(config.on_demand_programs(), notifier.hold)
         # Late commands show that the broker's queue for this link is long: see _drop_late.
         forwarder.note_age = lambda late: self._late.note(late, clock())
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
         self._heartbeat_at = self._flooded_at = -inf
-        self._shed = 0  # messages, as logged last
+        self._shed = 0  # messages that were dropped for lack of room, as logged last
         self._suit_transport()
 
     @property

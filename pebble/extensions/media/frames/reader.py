@@ -152,7 +152,7 @@ class FrameReader:
             if arrival is None:
                 if end is not None and time.monotonic() >= end:
                     return None
-            elif not self._must_reopen.is_set():
+            elif not self._must_reopen.is_set():  # else the frame may be in memory that must not be mapped
                 frame = self._frame(arrival)
                 if frame is not None:
                     return frame

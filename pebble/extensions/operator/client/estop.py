@@ -191,7 +191,7 @@ class RobotStop:
         # every robot gets zeros: it may have no emergency stop, or its broker may refuse it
         drive_topics = dict.fromkeys((estop.drive_topic, *estop.zeros))
         messages += [_message(DRIVE, topic, _ZERO) for topic in drive_topics]
-        if self._order.own_only:
+        if self._order.own_only:  # capabilities may name what is no command to this robot
             return [message for message in messages if _is_incoming(message.topic, self.estop.base)]
         return messages
 

@@ -189,7 +189,7 @@ class RobotView:
         """
         if message.retain or not message.payload:
             self.parked = bool(message.payload)
-            with suppress(PayloadError):
+            with suppress(PayloadError):  # a command that cannot be read counts as one that moves it
                 self.parked = self.parked and codec.decode(c.DRIVE, message.payload).moves
 
     def _keep_for_late_stop(self, message: Message) -> None:

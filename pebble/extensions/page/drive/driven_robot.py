@@ -89,7 +89,7 @@ class Tab:
     user: str
     device: str
     clock: PageClock = field(default_factory=PageClock)
-    moves: "DrivenRobot | None" = None
+    moves: "DrivenRobot | None" = None  # the robot that it moves now
     gesture: int = -1  # by which it moves that robot
     last_ended: int = -1  # this gesture and all before it have ended
 
@@ -261,7 +261,7 @@ class DrivenRobot:
             return tab.interrupt(op.g, now), why
         if tab.moves is None:
             tab.moves, tab.gesture = self, op.g
-            self._sent_at, self._repeats = float("-inf"), []  # repeated zeros would interrupt it
+            self._sent_at, self._repeats = float("-inf"), []  # to be sent at once; an old zero would end it
             self._on(Event.MOVES, now)
         self._received_at = now
         pace = self.pace

@@ -152,6 +152,7 @@ def _mend_file(source: Path, target: Path | None) -> int:
 
 def _mend_all(folder: Folder) -> int:
     """Finish the files that a killed recorder left; return the exit code."""
+    # The caller holds the folder's lock: what is active was left by a killed recorder.
     unfinished, failed = [entry.path for entry in folder.entries() if entry.is_active], False
     for path in unfinished:
         try:

@@ -248,12 +248,12 @@ class RecordingFile:
                 start_ns, end_ns, *_ = CHUNK.unpack(self._read(at + HEAD.size, CHUNK.size))
                 chunk = Chunk(start_ns, end_ns, at, end - at, channels, messages)
                 self.chunks.append(chunk)
-                if not channels or not channels <= self.channels.keys():
+                if not channels or not channels <= self.channels.keys():  # else no channel in it is new
                     self._learn(chunk)
             elif op == Op.METADATA:
                 self._metadata.append(at)
             elif op == Op.CHANNEL:
-                self._name(self._record(at), is_certain=False)
+                self._name(self._record(at), is_certain=False)  # it is outside of chunks
 
     def _learn(self, chunk: Chunk) -> None:
         """Note the channels that a chunk declares."""
