@@ -306,6 +306,7 @@ class Trial:
         """Run rows with a mutant; write the result, and return it."""
         start, file = time.monotonic(), record["file"]
         script = file.endswith(".js")
+        # Functions whose code a fork can exchange. None: all rows run with the changed file instead.
         swaps = [] if script or reached_by & self.imported else self.swaps(file, text)
         names = [name for name in self.rows if not swaps or reached_by & self.lines[name]]
         seconds = sum(self.rows[name][0] for name in names)
