@@ -72,7 +72,7 @@ class Mirroring:
 
     def is_possible(self) -> bool:
         """True if no side sends our own messages back. Otherwise commands would be repeated, even after a stop."""
-        if all(state.transport.exact_echo for state in self._sides.values()):
+        if all(state.transport.exact_echo for state in self._sides.values()):  # then echo=False is kept to
             return True
         if not self._was_refused:
             self._was_refused = True
@@ -209,7 +209,7 @@ class Forwarder:
     def _receive_named(self, source: SideState, names: Names, message: Message) -> Routed:
         """Forward a message whose sender is checked: the name moves from the topic into the payload."""
         sender = names[message.topic]
-        subject, by = sender.subject, sender.account  # Signed, below, has the person for whom it acts, too
+        subject, by = sender.subject, sender.account  # Signed, below, adds the person for whom the account acts
         outcome = self.admit(source, subject, message, sender.topic, by != NO_ACCOUNT)
         if subject is None:
             outcome = sender.foreign  # why the topic means nothing to this robot
@@ -351,7 +351,7 @@ class Forwarder:
             payloads = list(self._pass_stop(source.side, message.payload))
             for payload in payloads:
                 self.publisher.publish(target, subject, Message(message.topic, payload, message.qos), forward)
-            return forward if payloads else Drop.RESET  # reset since; in the mirror: meant for one motor owner
+            return forward if payloads else Drop.RESET  # reset since that stop; or, in the mirror, it is for one owner
         if is_event:
             self.publisher.note_return(target, subject, message)
             target.events.send(message)
