@@ -72,7 +72,7 @@ class Mirroring:
 
     def is_possible(self) -> bool:
         """True if no side sends our own messages back. Otherwise commands would be repeated, even after a stop."""
-        if all(state.transport.exact_echo for state in self._sides.values()):
+        if all(state.transport.exact_echo for state in self._sides.values()):  # then echo=False is kept to
             return True
         if not self._was_refused:
             self._was_refused = True
@@ -351,7 +351,7 @@ class Forwarder:
             payloads = list(self._pass_stop(source.side, message.payload))
             for payload in payloads:
                 self.publisher.publish(target, subject, Message(message.topic, payload, message.qos), forward)
-            return forward if payloads else Drop.RESET  # reset since; in the mirror: meant for one motor owner
+            return forward if payloads else Drop.RESET  # reset since that stop; or, in the mirror, it is for one owner
         if is_event:
             self.publisher.note_return(target, subject, message)
             target.events.send(message)

@@ -74,7 +74,7 @@ class MotionInbox:
         self._turns: dict[str, p.ControlTurn] = {}  # by owner
         self._lost = False  # messages, since the last batch
         self._vouched: p.ControlVouched | None = None
-        self._drives: dict[int, list[ReceivedDrive]] = {}  # by sender, the newest sender last
+        self._drives: dict[int, list[ReceivedDrive]] = {}  # by run, PERSON or _HOLDER; the newest sender last
 
     def put_stop(self, stop: p.EstopCommand) -> bool:
         with self._lock:

@@ -102,7 +102,7 @@ _RIGHTS: Mapping[str, frozenset[Right]] = {
 }
 ROLES = tuple(_RIGHTS)
 _ALONE = frozenset(ProgramRole)  # roles that go with no other one, but for these two:
-_BOTH = {ProgramRole.PAGE, ProgramRole.EXPANDER}
+_GO_TOGETHER = {ProgramRole.PAGE, ProgramRole.EXPANDER}
 
 
 class Rule(NamedTuple):
@@ -170,7 +170,7 @@ def conflict(roles: Sequence[str]) -> str:
     for role in roles or ("",):  # an account without roles is refused as one with the role ""
         if role not in _RIGHTS:
             return f"{role!r} is no role: use {', '.join(ROLES)}"
-    if len(set(roles)) == 1 or set(roles) == _BOTH:
+    if len(set(roles)) == 1 or set(roles) == _GO_TOGETHER:
         return ""
     alone = [role for role in roles if role in _ALONE]
     return f"{alone[0]} goes with no other role" if alone else ""
@@ -279,9 +279,10 @@ def _of_expander() -> Iterator[Rule]:
     for channel in c.CHANNELS:
         if channel.kind is Kind.STREAM and channel.remote and channel.bridged and channel is not c.STREAMS:
             yield Rule("write", channel.filter(_ANY))
+    # How groups are written, the groups, and announcements of expanders, also those with a name: only one may work.
     for suffix in (c.WIRE.suffix, c.STREAMS.suffix, c.EXPANDER.suffix, f"{INCOMING}/{BY}/+/{c.EXPANDER.metric}"):
         yield Rule("read", f"{_ANY}/{suffix}")
-    yield Rule("read", f"{c.SHORT}+")
+    yield Rule("read", f"{c.SHORT}+")  # the short topics of groups
 
 
 def _of_rights(

@@ -122,7 +122,7 @@ def at_the_wheel(robot: Observer, by: str = BY, answer_s: float = ANSWER_S) -> I
             robot.answers(lambda: driver.holds, answer_s)
         if driver.may_drive:
             driver.send()
-            robot.wait(lambda: moves_until(robot, time.monotonic()) != inf, ANSWER_S)
+            robot.wait(lambda: moves_until(robot, time.monotonic()) != inf, ANSWER_S)  # until it is not seen to move
         yield driver
     finally:
         if driver.may_drive:

@@ -139,11 +139,11 @@ class TerminalDriver:
             motion = f"driving x {x:+.2f} z {z:+.2f}"
         parts = (
             self.name,
-            robot.itself,
+            robot.itself,  # that it drives itself, by a script
             motion,
             self.unconfirmed and f"EMERGENCY STOP NOT CONFIRMED: {self.unconfirmed}",
             f"{view.asks} asks for control: l lets {view.asks} drive" if view.you and view.asks else "",
-            *([] if view.you else self._failures),
+            *([] if view.you else self._failures),  # ``you``: this terminal has control
             "" if robot.volts is None else f"{robot.volts:.1f} V",
             "" if not robot.slow_s else f"slow connection: commands take {robot.slow_s:.1f} s",
             self._note,
