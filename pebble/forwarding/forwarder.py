@@ -325,7 +325,7 @@ class Forwarder:
         tells_age = forward.stamped and STAMP_LETTER in message.payload and STAMP in message.payload
         waited_s = self.ages.waited_s(subject, message, account) if tells_age else message.waited_s
         late = waited_s > subject.waits_s and not ends_something(subject, message)
-        # Many late ones are a flood, except those that tell their age: their senders keep to the pace of the link.
+        # Many late commands show a flood; not those that tell their age, whose senders keep to the pace of the link.
         if forward.stamped and not (late and tells_age):
             self.note_age(late)
         return late

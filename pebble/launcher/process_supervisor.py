@@ -223,7 +223,7 @@ class ProcessSupervisor:
             self._child.terminate()
         else:
             self.state = without_child
-            self.policy.stopped(None)
+            self.policy.stopped(None)  # None: no process was running
             self._on_change()
 
     def _watch_exit(self, child: Child) -> None:

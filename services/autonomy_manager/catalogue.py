@@ -68,7 +68,7 @@ class _Answer(NamedTuple):
     problem: str = ""
     broken: bool = False
     asked: bool = True  # False: what it says itself is not known yet
-    measures: bool = False
+    measures: bool = False  # it only measures: it says itself that it never drives
 
 
 class Catalogue:

@@ -107,7 +107,7 @@ class MqttMirror(ForwardingService):
             self._request_again()
             self.call_at(self.clock() + _ARRIVAL_S, partial(self._begin, epoch, latest))
             return
-        barrier(self.remote, self._probe_topic)
+        barrier(self.remote, self._probe_topic)  # a probe that the broker has sent by now counts below
         if epoch != self.epoch or self.forwarder.gate is not Gate.WAITING:
             return
         if self._is_operators and not self._announced:  # without a new probe the earlier verdict stands

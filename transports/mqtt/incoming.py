@@ -126,7 +126,7 @@ class Incoming:
 
     def _receive(self, client: Client, now: float) -> int:
         """Read once from the socket; return the number of bytes, from which the ages of messages are estimated."""
-        age, waiting = self.age, self.age.waiting
+        age, waiting = self.age, self.age.waiting  # waiting: since when bytes may have been in the socket
         age.received_at = now
         if now - waiting.checked_at > OVERSLEPT_S and self.accepted is not None:
             self.pings.send_after_stall(client, now)

@@ -204,15 +204,15 @@ def metrics(right: Right, extra: Extra | None = None) -> tuple[str, ...]:
     return (*(re.sub(r"{[^}]*}", "+", metric) for metric in declared), *getattr(extra, right, ()))
 
 
-def covered(right: Right, metric: str) -> str:
-    """Return a metric of the contract that the filter ``metric`` matches, but for which ``right`` is not enough.
+def covered(right: Right, filter_: str) -> str:
+    """Return a metric of the contract that ``filter_`` covers, but that ``right`` may not write.
 
-    Empty if there is none: then :class:`Extra` may grant ``metric`` to this right.
+    Empty if there is none: then :class:`Extra` may grant ``filter_`` to this right.
     """
     for channel in c.CHANNELS:
         if channel.direction == INCOMING and channel not in WRITES[right]:
             declared = re.sub(r"{[^}]*}", "+", channel.metric)
-            if any(_overlap(metric, filter_) for filter_ in (declared, f"{BY}/+/{declared}")):
+            if any(_overlap(filter_, other) for other in (declared, f"{BY}/+/{declared}")):
                 return channel.metric
     return ""
 

@@ -260,11 +260,13 @@ def _clamped(robot: Observer, driver: Driver) -> CheckResult:
 def _foreign_key(robot: Observer, driver: Driver) -> CheckResult:
     """Check that commands with another's key move nothing, while someone has control and while nobody has."""
     why, fix = "it moves by another's key", "refuse what moves and has another key"
-    outcome = _moved(robot, driver.drive(key=_OTHER_KEY)[0], why, fix)
+    began, _ = driver.drive(key=_OTHER_KEY)
+    outcome = _moved(robot, began, why, fix)
     if outcome.state is not State.OK:
         return outcome
     driver.leaves()
-    return _moved(robot, driver.drive(DRIVES_S / 2, key=_OTHER_KEY)[0], f"{why} while no one has control", fix)
+    began, _ = driver.drive(DRIVES_S / 2, key=_OTHER_KEY)
+    return _moved(robot, began, f"{why} while no one has control", fix)
 
 
 def _control_passes(robot: Observer, driver: Driver) -> CheckResult:
