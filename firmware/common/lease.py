@@ -14,7 +14,7 @@ class Lease:
     """
 
     def __init__(self, now: int, diff, random, strangers: int) -> None:
-        """Store the arguments; ``random(4)`` returns 8 hex digits.
+        """Store the arguments; ``random(4)`` returns 8 hex digits. See latch.py for ``diff``.
 
         ``strangers``: commands without a key move the motors always (0), while control is free (1), or never (2).
         """
