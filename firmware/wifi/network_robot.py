@@ -58,7 +58,7 @@ class NetworkRobot:
             topics += (b"group",)
         plain = len(topics)  # so many are subscribed to without an account
         if names:  # clients without one may stop, and send zeros; those that may drive may also have control
-            plain = _DRIVE + 1 if strangers == 2 else _CONTROL + 1
+            plain = _DRIVE + 1 if strangers == 2 else _CONTROL + 1  # 2: they are refused
         self.session = Session(settings, root, topics, plain, names, wrap, self._take)
         self.stops = EmergencyStop(now, _DRIVE_LIMIT_MS, strangers, names)
         self.deadman = DeadMan(_DRIVE_LIMIT_MS)
