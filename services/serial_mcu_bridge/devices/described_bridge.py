@@ -80,7 +80,7 @@ class DescribedBridge(SerialService):
         self._session = Session(self.config.base)
         self.watchdog = ImuWatchdog(self.options, self.instance)
         self._peers = PeerDevices()
-        self._token = secrets.token_hex(8)  # of our question about our uid: another token is of a device with the same uid
+        self._token = secrets.token_hex(8)  # of our question about our uid: another token is from a second device
         self._conflict_logged = False  # another device has the same uid
         self.device: Device | None = None
         self._published_states: dict[int, tuple[Reading, int]] = {}  # newest of each state interface, its epoch ms
