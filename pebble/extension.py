@@ -266,11 +266,11 @@ def _check_parts(extension: Extension, section: type) -> None:
     for kind, check in part(extension.rules) if extension.rules else ():
         if not (isinstance(kind, type) and issubclass(kind, section) and callable(check)):
             raise PebbleError("its rules are no pairs of a Section and a function")
-    if len({*extension.motors.values()}) < len(extension.motors):
+    if len(set(extension.motors.values())) < len(extension.motors):
         raise PebbleError("two of its motors are of one program, which can own one")
     if extension.programs:
         part(extension.programs)
-    elif {*extension.motors.values()} - ({program.name} if program else set()):
+    elif any(program is None or name != program.name for name in extension.motors.values()):
         raise PebbleError("its motors are of a program that it does not have")
     if program is not None and find_spec(program.module.partition(":")[0]) is None:
         raise PebbleError(f"the module of its program, {program.module}, is not installed")

@@ -116,7 +116,7 @@ def read_for(place: Path, file: Path) -> bytes:
     Raises OSError, and PebbleError as :func:`owner_of`.
     """
     if hasattr(os, "geteuid") and os.geteuid() == 0:
-        owner = owner_of(place, nameless=False, there=True)
+        owner = owner_of(place, nameless=False, there=True)  # of users with a name; it must exist
         if owner.uid:
             with as_user(owner):
                 return read_plain(file)

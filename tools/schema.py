@@ -43,7 +43,8 @@ def _complete(definition: dict[str, Any], kind: type[Section]) -> None:
     """Add choices, lists as one line, comments and retired keys; drop defaults of sections, whose keys have them."""
     properties = definition["properties"]
     for field in fields(kind):
-        choices = [choice for meta in unwrap(field.type)[1] for choice in (meta.extra or {}).get("choices", ())]
+        _, metas = unwrap(field.type)
+        choices = [choice for meta in metas if meta.extra for choice in meta.extra.get("choices", ())]
         if choices:
             properties[field.encode_name]["enum"] = choices
     for value in properties.values():

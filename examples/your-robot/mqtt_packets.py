@@ -54,7 +54,7 @@ class Reader:
         while self.skip():
             size, start = self.length()
             end = start + min(size, LONGEST)
-            if start == 0 or len(self.data) < end:
+            if start == 0 or len(self.data) < end:  # its length, or its content, has not arrived completely
                 return
             first, content = self.data[0], self.data[start:end]
             if first & 0xF0 == PUBLISH and self.skip_long_topic(start, size):

@@ -71,7 +71,7 @@ class Arbiter:
             return REFUSED
         limit = self._watchdog_ms if valid_ms < 0 or valid_ms > self._watchdog_ms else int(valid_ms)
         if run == PERSON:
-            self._take(moves, valid_ms == 0 or not ours, now)
+            self._take(moves, valid_ms == 0 or not ours, now)  # final: it is valid for 0 ms, or another has control
         # people first; and not before scripts may run, nor of a run that is barred
         elif self._held or self._starting or (run > 0 and not newer(run, self.barred)):
             return REFUSED

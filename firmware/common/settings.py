@@ -22,7 +22,7 @@ def get(settings: dict, section: str, name: str, default=None):
         value = settings.get(section, {}).get(name, default)
     except AttributeError:
         value = None
-    if value is None or "" in settings:
+    if value is None or "" in settings:  # "": the file could not be read, see load
         what = "is no JSON" if "" in settings else "lacks " + section + "." + name
         raise ValueError("private_config.json " + what)
     return value

@@ -87,7 +87,7 @@ class Robot:
         for _ in range(_AT_ONCE):
             byte = port.read()
             if byte < 0:
-                lines.rest(now)
+                lines.rest(now)  # drops an unfinished line, after a while
                 break
             lines.take(byte)
             port.send()  # now, too: the ring has no room for the answers to many short lines

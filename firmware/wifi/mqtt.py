@@ -54,7 +54,7 @@ class Client:
         """
         data = self.data
         self._end += count
-        while not self._more and len(self.out) - self.waiting > 6:  # room for an answer, and for a ping
+        while not self._more and len(self.out) - self.waiting > 6:  # out has room: for an answer, and for a ping
             skipped = min(self._skip, self._end - self._at)
             self._skip -= skipped
             start = at = self._at = self._at + skipped

@@ -64,7 +64,7 @@ class NetworkRobot:
         self.deadman = DeadMan(_DRIVE_LIMIT_MS)
         self.body = body
         self.refused = 0  # commands that were retained, and drive commands that were invalid or not admitted
-        self._next: tuple | None = None  # the newest drive command that was admitted in this turn
+        self._next: tuple | None = None  # the newest drive command admitted in this turn, as by `parse`: x, z, y, ...
         self._limit_ms = 0  # how long it moves the motors
         self._void = False  # a stop was received in this turn
         self._due = now  # the next heartbeat
@@ -80,12 +80,13 @@ class NetworkRobot:
             self._halt()
             self.stops.save()
             self.session.drop(now, str(error))
-        self._guard(time.ticks_ms())
+        self._guard(time.ticks_ms())  # again: the turn itself may have taken long
 
     def stop(self) -> None:
         self.body.stop()
 
     def _guard(self, now: int) -> None:
+        """Stop the motors if control has passed on or their time is over; let the body repeat what was not received."""
         stops = self.stops
         stops.tick(now)
         if stops.lease.halts:  # each new driver begins with wheels at rest
@@ -116,9 +117,9 @@ class NetworkRobot:
         self._void = False
         now = time.ticks_ms()
         self.session.read(now)
-        self.stops.save()
+        self.stops.save()  # now: a stop, or a reset, leaves the motors off
         if self._next and not self._void and not self.stops.lease.halts:
-            if self.body.drive(*self._next[:3]):
+            if self.body.drive(*self._next[:3]):  # x, z, y
                 self.deadman.limit_ms = self._limit_ms
                 self.deadman.feed(now)
             else:

@@ -72,7 +72,7 @@ class Query:
         self.host = host
         self._port = port
         self.data = data
-        self._skip = skip
+        self._skip = skip  # see query_name
         self._due = now
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.setblocking(False)

@@ -38,7 +38,7 @@ def reading_of(annotation: Any, kind: Any, metas: list[Meta], raw: Any, default:
         except (msgspec.ValidationError, TypeError):
             continue
         if not isinstance(value, float) or math.isfinite(value):
-            return Reading(value, differs=False)
+            return Reading(value, differs=False)  # its meaning is the same
     if "unlike" in extra:
         return Reading(extra["unlike"])
     if raw and isinstance(raw, str) and kind not in (int, float):
@@ -50,7 +50,7 @@ def reading_of(annotation: Any, kind: Any, metas: list[Meta], raw: Any, default:
     if kind not in (int, float) or number is None or "exact" in extra:
         return None
     for meta in metas:
-        if meta.gt is not None and number <= meta.gt:  # no number is the nearest above a limit
+        if meta.gt is not None and number <= meta.gt:  # above such a limit no number is the nearest
             return None if default is NODEFAULT else Reading(default)
         if meta.ge is not None:
             number = max(meta.ge, number)

@@ -61,7 +61,7 @@ class Reader:
             if self._other_forms and "enabled" in keys and switch(raw) is not None:
                 raw = {"enabled": raw}  # a mere true or false in place of the section
             else:
-                raw = self._otherwise(kind, raw, path, {} if path else NODEFAULT)  # the whole file has no default
+                raw = self._replacement(kind, raw, path, {} if path else NODEFAULT)  # the whole file has no default
         values: dict[str, Any] = {}
         pairs = () if raw is _WRONG else raw.items()  # a refused section has all its defaults
         for written, value in pairs:
@@ -107,7 +107,7 @@ class Reader:
         return None
 
     def _value(self, annotation: Any, raw: Any, path: problems.Path, default: Any = NODEFAULT) -> Any:
-        """Return the value of a key, or _WRONG. What cannot be read as the key's kind is a matter of _otherwise."""
+        """Return the value of a key, or _WRONG. What the key does not accept goes to _replacement."""
         kind, metas = unwrap(annotation)
         container = get_origin(kind)
         if _is_section(kind):
@@ -126,10 +126,10 @@ class Reader:
             if isinstance(raw, str):
                 return self._path(raw, metas, path)
         else:
-            return self._plain(annotation, raw, path, default)
-        return self._otherwise(annotation, raw, path, default)
+            return self._scalar(annotation, raw, path, default)
+        return self._replacement(annotation, raw, path, default)
 
-    def _plain(self, annotation: Any, raw: Any, path: problems.Path, default: Any) -> Any:
+    def _scalar(self, annotation: Any, raw: Any, path: problems.Path, default: Any) -> Any:
         kind, metas = unwrap(annotation)
         choices = _choices(kind, metas)
         if choices and isinstance(raw, str):
@@ -137,12 +137,12 @@ class Reader:
         try:
             value = msgspec.convert(raw, annotation)
         except msgspec.ValidationError:
-            return self._otherwise(annotation, raw, path, default)
+            return self._replacement(annotation, raw, path, default)
         if choices and value not in choices:
-            return self._otherwise(annotation, raw, path, default)
+            return self._replacement(annotation, raw, path, default)
         return Secret(value) if _extra(metas, "secret") else self._parsed(metas, value, path)
 
-    def _otherwise(self, annotation: Any, raw: Any, path: problems.Path, default: Any) -> Any:
+    def _replacement(self, annotation: Any, raw: Any, path: problems.Path, default: Any) -> Any:
         """Return the value to use for ``raw``, which the key does not accept; note it unless only the form differs."""
         kind, metas = unwrap(annotation)
         shown = "a value of another kind" if _extra(metas, "secret") else _shown(raw)
@@ -158,7 +158,7 @@ class Reader:
         if reading is None or is_raw:  # raw was refused before this call, and would be again
             self.notes.problem(path, must_be)
             return _WRONG
-        return self._plain(annotation, reading.value, path, NODEFAULT)
+        return self._scalar(annotation, reading.value, path, NODEFAULT)
 
     def _parsed(self, metas: list[Meta], value: Any, path: problems.Path) -> Any:
         parse = _extra(metas, "parse")

@@ -15,7 +15,7 @@ def hidden(text: str, *, words: bool = False) -> str:
 
     ``words``: a blank, a tab and a new line may stand anywhere.
     """
-    may_hide = not (text.isprintable() and text.isascii())
+    may_hide = not (text.isprintable() and text.isascii())  # else no character of it needs a look
     for place, char in enumerate(text if may_hide else ""):
         is_allowed = words and char in "\t\n\r"
         if not is_allowed and _is_hidden(char) and not _joins(text, place):

@@ -102,7 +102,7 @@ def untypeable(name: str) -> str:
 
 def meant(names: Iterable[str], typed: str) -> str:
     """Return ``typed``, or if it is no name, the one in ``names`` that looks like it. PebbleError if several do."""
-    if typed.isascii():
+    if typed.isascii():  # without accents, which can be written in two ways
         return typed
     alike = [name for name in names if composed(name) == composed(typed)]
     if typed in alike or not alike:

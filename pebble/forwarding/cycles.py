@@ -87,8 +87,7 @@ class Cycles:
     def examine(self, side: Side, subject: Subject, message: Message) -> Finding:
         """Return the finding about a message from ``side`` that may be forwarded. Hot.
 
-        Counts the message, and notes an answered probe. A message that runs something may pass while its topic
-        circulates: the caller recognises the message when it comes back.
+        Counts the message, and notes an answered probe. What runs something may pass while its topic circulates.
         """
         topic, payload = message.topic, message.payload
         if subject.is_stop:
@@ -104,7 +103,8 @@ class Cycles:
                 may_pass = subject.runs or not is_one_shot  # the caller recognises such messages when they come back
                 if not may_pass or count > SUSPICIOUS:
                     return Finding.CIRCULATES
-            period = _PERIOD_IN_STORM_S if count > STORM and not way.closed else PROBE_PERIOD_S  # closed: known
+            is_new_storm = count > STORM and not way.closed  # a closed way is known to circulate
+            period = _PERIOD_IN_STORM_S if is_new_storm else PROBE_PERIOD_S
             never_probed = way.probed_at == float("-inf")
             # Where any topic circulates, all others may as well.
             is_suspicious = way.closed or count > usual or (never_probed and bool(self.closed_ways))

@@ -72,7 +72,7 @@ class Mirroring:
 
     def is_possible(self) -> bool:
         """True if no side sends our own messages back. Otherwise commands would be repeated, even after a stop."""
-        if all(state.transport.exact_echo for state in self._sides.values()):
+        if all(state.transport.exact_echo for state in self._sides.values()):  # then echo=False is kept to
             return True
         if not self._was_refused:
             self._was_refused = True
@@ -325,7 +325,7 @@ class Forwarder:
         tells_age = forward.stamped and STAMP_LETTER in message.payload and STAMP in message.payload
         waited_s = self.ages.waited_s(subject, message, account) if tells_age else message.waited_s
         late = waited_s > subject.waits_s and not ends_something(subject, message)
-        # Many late ones are a flood, except those that tell their age: their senders keep to the pace of the link.
+        # Many late commands show a flood; not those that tell their age, whose senders keep to the pace of the link.
         if forward.stamped and not (late and tells_age):
             self.note_age(late)
         return late
@@ -351,7 +351,7 @@ class Forwarder:
             payloads = list(self._pass_stop(source.side, message.payload))
             for payload in payloads:
                 self.publisher.publish(target, subject, Message(message.topic, payload, message.qos), forward)
-            return forward if payloads else Drop.RESET  # reset since; in the mirror: meant for one motor owner
+            return forward if payloads else Drop.RESET  # reset since that stop; or, in the mirror, it is for one owner
         if is_event:
             self.publisher.note_return(target, subject, message)
             target.events.send(message)

@@ -33,7 +33,7 @@ class Publisher:
 
     def publish(self, to: SideState, subject: Subject, message: Message, forward: Forward) -> None:
         topic, payload, transport = message.topic, message.payload, to.transport
-        if subject.runs or self._cycles.closed_ways:
+        if subject.runs or self._cycles.closed_ways:  # it must run only once, or some topic circulates
             self.note_return(to, subject, message)
         echoing = not transport.exact_echo and subject.is_two_way
         if echoing:

@@ -168,7 +168,7 @@ class Reconciliation:
         self._synchronized[side] = True
         due: list[tuple[Side, str, bytes]] = []
         if side is self._winner:
-            self._overtaken.clear()
+            self._overtaken.clear()  # no older value of the winner is to come; for late ones there is _newer
             for topic, payload in self._held.items():
                 self._set(topic, payload, side.other)
                 due.append((side, topic, payload))  # to the winner, which has none
@@ -180,7 +180,7 @@ class Reconciliation:
             if topic not in released and self._is_missing(side, topic, last)
         ]
         if side is self._winner:
-            self._offered.update(topic for _, topic, _ in due)
+            self._offered.update(topic for _, topic, _ in due)  # the winner seems to lack all of them
         return due
 
     def _set(self, topic: str, payload: bytes, side: Side) -> None:

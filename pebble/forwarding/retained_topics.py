@@ -124,9 +124,9 @@ class RetainedTopics:
             return Drop.KNOWN  # certainly retained, and came late: it is older than the live one before it
         if len(source.seen) < _MAX_WAITING:
             source.seen.add(topic)
-        retained = self._sides.gate is not Gate.SHUT and self._is_retained(source, message)
+        retained = self._sides.gate is not Gate.SHUT and self._is_retained(source, message)  # shut: all count as live
         if only_old and not retained:
-            return Drop.UNNAMED
+            return Drop.UNNAMED  # live, and its sender has no account: only an old one may be the robot's own
         ours_may_come_back = not any(state.transport.exact_echo for state in self._sides.values())
         if not retained and ours_may_come_back and self._reconciliation.value(topic) == payload:
             return Drop.KNOWN

@@ -183,8 +183,8 @@ class ForwardingService(Service, ABC):
                 self.call_at(self.clock() + QUIET_S, synchronize)  # more may come
             elif side is Side.LOCAL or epoch == self.epoch:  # the remote side has not been lost meanwhile
                 self.forwarder.retained.synchronize(side)
-                # Commands are probed only now: a mirror of the wrong broker has stopped by now.
-                if side is Side.REMOTE or self.rules.leaves_robot:  # a mirror probes only when its broker was away
+                # By now a mirror of the wrong broker has stopped. A mirror probes only when its broker was away.
+                if side is Side.REMOTE or self.rules.leaves_robot:  # leaves_robot: this is the bridge
                     self.forwarder.publisher.probe_commands(*self.probed_sides)
 
         self.call_at(self.clock() + INITIAL_SYNC_S, synchronize)

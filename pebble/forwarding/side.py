@@ -38,12 +38,12 @@ class SideState:
         self.events = EventBuffer(transport, counters, clock=clock)
         self.window = RetainedWindow(transport, clock)
         self.loopback = LoopbackFilter(clock)  # of a broker without bridge mode
-        self.returns = LoopbackFilter(clock, _RETURN_S)  # messages that circulate, once each
+        self.returns = LoopbackFilter(clock, _RETURN_S)  # those on topics that circulate: each comes back once
         self.seen: set[str] = set()  # two-way topics that have had a message since we subscribed
-        self.restarted = False  # its retained messages come again, and the reconciliation has not been told
+        self.restarted = False  # its connection was lost, and the reconciliation is still to be told
         self._clock, self._wins = clock, wins
         self._lost_at = float("-inf")  # when its state was last another than connected; -inf: never
-        # Its retained messages are older than ours (if this side wins), or may be (if not); False once all are here.
+        # Its broker has restored older retained messages (if this side wins), or may have; False once all are here.
         self._went_back = False
 
     @property

@@ -132,7 +132,7 @@ class ProcessSupervisor:
         rate = _SCRIPTS_LINES_PER_S if self.program.runs_scripts else LINES_PER_S
         self._pipes = Pipes(child, self._reactor, partial(self._printed, child.pid), self._noted, rate=rate)
         self._watch_exit(child)
-        if not self.program.plain:
+        if not self.program.plain:  # a plain one gives no signs of life
             self._check_at(self.policy.stuck_at)
         self._on_change()
 
@@ -223,7 +223,7 @@ class ProcessSupervisor:
             self._child.terminate()
         else:
             self.state = without_child
-            self.policy.stopped(None)
+            self.policy.stopped(None)  # None: no process was running
             self._on_change()
 
     def _watch_exit(self, child: Child) -> None:

@@ -74,7 +74,7 @@ class MotionInbox:
         self._turns: dict[str, p.ControlTurn] = {}  # by owner
         self._lost = False  # messages, since the last batch
         self._vouched: p.ControlVouched | None = None
-        self._drives: dict[int, list[ReceivedDrive]] = {}  # by sender, the newest sender last
+        self._drives: dict[int, list[ReceivedDrive]] = {}  # by run, PERSON or _HOLDER; the newest sender last
 
     def put_stop(self, stop: p.EstopCommand) -> bool:
         with self._lock:
@@ -100,7 +100,7 @@ class MotionInbox:
             sender = self._control.sender(request)
             waiting = self._requests.pop(sender, None)
             if len(self._requests) >= _REQUESTS:
-                knows = self._control.knows  # a client without control gives way, but not the first that asks
+                knows = self._control.knows  # a client gives way that neither has control nor is the first to ask
                 del self._requests[next(key for key, received in self._requests.items() if not knows(received.request))]
                 self.dropped += 1
             waiting_takes_over = waiting is not None and waiting.over  # a renewal must not undo that

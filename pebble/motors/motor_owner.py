@@ -201,7 +201,7 @@ class MotorOwner(Service, ABC):
             self._guard.bar(turn.barred, self.clock())
             self._note_control()
         if batch.lost:
-            self._control.doubt(self.clock())
+            self._control.doubt(self.clock())  # no silence until now counts against the holder of control
         for received in batch.drives:
             if not (only_halts and received.drive.moves):  # after a stop that latches, the guard refuses them
                 self._drive(received)
@@ -246,9 +246,9 @@ class MotorOwner(Service, ABC):
         now = self.clock()
         if now - received.at > c.CONTROL.waits_s and not received.request.ends():
             self.count_late(c.CONTROL)
-            self._control.doubt(now)
+            self._control.doubt(now)  # no silence until now counts against the holder of control
             return
-        self._control.request(received.request, received.over, now)
+        self._control.request(received.request, received.over, now)  # ``over``: without asking the holder
         self._note_control()
 
     def _note_control(self) -> None:

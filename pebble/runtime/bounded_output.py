@@ -58,7 +58,7 @@ class BoundedOutput:
         return data[begin:]
 
     def tick(self, now: float) -> None:
-        """Write the number of dropped lines, if that is due."""
+        """Compute how many lines may pass now, as :meth:`feed` needs it; write the number of dropped ones if due."""
         self._tokens = min(self._most, self._tokens + (now - self._filled_at) * self._rate)
         self._filled_at = now
         quiet = now - self._suppressed_at >= _QUIET_S

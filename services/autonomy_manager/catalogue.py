@@ -68,7 +68,7 @@ class _Answer(NamedTuple):
     problem: str = ""
     broken: bool = False
     asked: bool = True  # False: what it says itself is not known yet
-    drives: bool = True
+    drives: bool = True  # False: it says itself that it only measures, and never drives
 
 
 class Catalogue:
@@ -125,7 +125,7 @@ class Catalogue:
     def _usable(self, name: str) -> bool:
         if name.startswith((".", "_")):
             return False
-        if len(name) > _LONGEST_NAME or not name.isprintable() or "]" in name:
+        if len(name) > _LONGEST_NAME or not name.isprintable() or "]" in name:  # which ends the tag of a log line
             self._complain(name[:_LONGEST_NAME], "%r is not offered: rename its folder", name)
             return False
         try:
@@ -233,7 +233,8 @@ class Catalogue:
     ) -> tuple[Setting, ...]:
         """Return the config's settings, and then those that only the script gives.
 
-        For our scripts the script's own description of an option counts more.
+        Of a setting in both, the config's counts. But our scripts read their options themselves: how such an option is
+        written on the command line is as the script says, and one that the script does not know is left out.
         """
         configured = [Setting(**asdict(argument)) for argument in section.args]
         options = {setting.key: setting for setting in described.configs}

@@ -144,7 +144,7 @@ class Runner:
     def _begin(self, plan: Plan) -> None:
         script = plan.main.script
         try:
-            number, baseline = self._service.begin_run(plan)
+            number, baseline = self._service.begin_run(plan)  # baseline: the motor owners' states before it
             self._run = run = Run(number, plan, baseline)
             self._service.halt(number)  # now the motor owner knows the run, so a person can stop it before it drives
             for step in plan.dependencies:

@@ -103,7 +103,8 @@ class Health:
                 what = f"{what}s again and again"
             yield "repeats", f"{what} since {check.same_s:.0f} s"
         if wrong_hz is not None and sound:
-            yield "rate", f"gives {wrong_hz / asked.rate * info.rate:.0f} samples a second where {info.rate} were asked"
+            samples_hz = wrong_hz / asked.rate * info.rate  # wrong_hz and asked.rate count pieces of sound
+            yield "rate", f"gives {samples_hz:.0f} samples a second where {info.rate} were asked"
         elif wrong_hz is not None:
             yield "rate", f"gives {wrong_hz:.1f} pictures a second where {asked.rate:g} were asked"
         if asked.width and (info.width, info.height) != (asked.width, asked.height):

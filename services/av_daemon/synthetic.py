@@ -85,7 +85,7 @@ class ComputedCamera(ComputedDevice, ABC):
         """Draw the picture that :meth:`look` has chosen into an array of shape (height, width, 3)."""
 
     def grab(self) -> Capture:
-        at_ns = self.look(self._pacer.next())
+        at_ns = self.look(self._pacer.next())  # chooses the picture that `draw` draws, if there is a reader
         return Capture(
             self._info,
             self._info.stride * self._info.height,

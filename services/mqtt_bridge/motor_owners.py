@@ -19,9 +19,9 @@ class MotorOwners:
         self.topics = {ESTOP_STATE.topic(base, owner=owner): owner for owner in owners}
         self._notifier = notifier
         # By topic:
-        self._messages = dict.fromkeys(self.topics, 0)  # how many of this connection arrived,
-        self._checked = dict(self._messages)  # and how many until the last check
-        self._waits_since: dict[str, float | None] = dict.fromkeys(self.topics)  # newest message, or the first check
+        self._messages = dict.fromkeys(self.topics, 0)  # how many arrived on this connection
+        self._checked = dict(self._messages)  # the same number at the last check
+        self._waits_since: dict[str, float | None] = dict.fromkeys(self.topics)  # newest live one, or the first check
         self._reported: dict[str, bool | None] = dict.fromkeys(self.topics)
 
     def connected(self) -> None:

@@ -148,7 +148,7 @@ class MqttBridge(ForwardingService):
             filters.append(with_name(self._stop_topic, "+"))
         make = partial(StopConnection, transport, filters, self._pass_stop, self._forwards, self.clock)
         if not self._is_thin:
-            return make(notices_s=self._silence_s + _NOTICED_S)
+            return make(notices_s=self._silence_s + _NOTICED_S)  # after that a lost connection is noticed
         transport.suit_link(thin=True)  # there this connection is worth its cost only while a client floods the link
         notices_s = max(self._silence_s, LEVELS["thin"].silent_s) + _NOTICED_S
         return make(notices_s=notices_s, grace_s=_THIN_GRACE_S, wanted=lambda: self._uplink.is_flooded)
@@ -167,7 +167,7 @@ class MqttBridge(ForwardingService):
             self.timers.add(self.clock(), self._follow_link, period=POLL_S)
         if self._same_broker.announces:
             self.timers.add(self.clock(), self._same_broker.report_arrival, period=_ARRIVAL_S)
-        self._look_later()
+        self._look_for_leftovers_later()
 
     # -- the service's thread
 
@@ -189,7 +189,7 @@ class MqttBridge(ForwardingService):
         if self._uplink.poll():
             self._publish_heartbeat()
 
-    def _look_later(self) -> None:
+    def _look_for_leftovers_later(self) -> None:
         """Look for messages that only the remote side retains, when all services have had time to publish theirs."""
         if self._leftovers.done:
             return
@@ -200,7 +200,7 @@ class MqttBridge(ForwardingService):
 
     def _look_for_leftovers(self) -> None:
         if self.forwarder.gate is not Gate.OPEN or not self._same_broker.both_connected:
-            self._look_later()
+            self._look_for_leftovers_later()
             return
         has_asked = self._leftovers.ask_next()
         wait_s, then = INITIAL_SYNC_S, self._remove_leftovers
@@ -211,7 +211,7 @@ class MqttBridge(ForwardingService):
     def _remove_leftovers(self) -> None:
         """Remove the retained topics that only the remote broker has; look later if nothing can be forwarded now."""
         if self.forwarder.gate is not Gate.OPEN or not self._same_broker.both_connected:
-            self._look_later()
+            self._look_for_leftovers_later()
             return
         removed = self._leftovers.remove(partial(self.forwarder.retained.remove, Side.REMOTE))
         if removed:
@@ -245,7 +245,7 @@ class MqttBridge(ForwardingService):
             self._same_broker.report_none()
             if self._stops is not None:
                 self._stops.main_lost(ended=self.remote.was_ended)
-        self._look_later()
+        self._look_for_leftovers_later()
         super().disconnected(side)
 
     def await_retained(self) -> None:

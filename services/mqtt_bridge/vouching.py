@@ -33,7 +33,7 @@ class Vouching:
             self._begin = self._end = now
         else:
             self._end = max(self._end, now - delivered_s)
-        self._losses = losses if passes else None
+        self._losses = losses if passes else None  # None: the next call begins anew, too
         return ControlVouched(begin=round(1000 * self._begin), end=round(1000 * self._end))
 
     def _delivered_s(self) -> float | None:

@@ -79,9 +79,9 @@ class MqttMirror(ForwardingService):
             return
         if epoch != self.epoch:
             return
-        if not self.remote.exact_echo:
+        if not self.remote.exact_echo:  # then echo=False is not kept to
             self._refuse('sends our own messages back; use one with bridge mode (mosquitto), or protocol "5"')
-        elif self.forwarder.gate is Gate.OPEN:
+        elif self.forwarder.gate is Gate.OPEN:  # checked on an earlier connection; a new probe shows another broker
             self.subscribe_remote()
             self._request_probe()
         else:
@@ -89,7 +89,7 @@ class MqttMirror(ForwardingService):
 
     def _check_broker(self, epoch: int) -> None:
         """Watch for probes of the bridge from the broker for some seconds, and forward nothing before that."""
-        self.forwarder.rearm()
+        self.forwarder.rearm()  # if it was shut: from now on messages wait for the result
         self._announced, self._under_way = False, bool(self._watched)  # until the bridge says that none is under way
         self.unsubscribe(Side.REMOTE)
         self.subscriptions[Side.REMOTE] = [
@@ -107,7 +107,7 @@ class MqttMirror(ForwardingService):
             self._request_again()
             self.call_at(self.clock() + _ARRIVAL_S, partial(self._begin, epoch, latest))
             return
-        barrier(self.remote, self._probe_topic)
+        barrier(self.remote, self._probe_topic)  # a probe that the broker has sent by now counts below
         if epoch != self.epoch or self.forwarder.gate is not Gate.WAITING:
             return
         if self._is_operators and not self._announced:  # without a new probe the earlier verdict stands
@@ -163,7 +163,7 @@ class MqttMirror(ForwardingService):
             self._under_way = message.payload != NO_PROBE
             if self._under_way:
                 self._announced = True
-                if self._probes.announce(message.payload):
+                if self._probes.announce(message.payload):  # it came from the broker before: that is the remote one
                     self.shut()
         # else a heartbeat: only the bridge publishes it; one from the broker is a reason to request a probe
 

@@ -125,7 +125,7 @@ def odometry(body: bytes) -> Odometry:
     reader = _Reader(body)
     header, child = reader.header(), reader.text()
     pose = reader.get("7d")
-    reader.skip(36 * 8)
+    reader.skip(36 * 8)  # the covariance of the pose
     speeds = reader.get("6d")
     return Odometry(header, child, pose[:3], pose[3:], speeds[0], speeds[5])
 
@@ -140,7 +140,7 @@ def route(body: bytes) -> Route:
     reader = _Reader(body)
     header, points = reader.header(), []
     for _ in range(reader.count()):
-        reader.header()
+        reader.header()  # of the point, not used
         points.append(reader.get("7d")[:3])
     return Route(header, points)
 
@@ -149,7 +149,7 @@ def goals(body: bytes) -> tuple[Header, list[Goal]]:
     reader = _Reader(body)
     header, goals = reader.header(), []
     for _ in range(reader.count()):
-        reader.skip(8)
+        reader.skip(8)  # when the goal was set
         name, (code,), text = reader.text(), reader.get("B"), reader.text()
         goals.append(Goal(name, code, text))
     return header, goals

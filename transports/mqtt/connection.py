@@ -350,8 +350,8 @@ class Connection:
                 return Outgoing()
             waiting = self._backlog.size + self._client.unwritten + unconfirmed_bytes(sock)
             round_trip_s, since = shortest_round_trip_s(sock), self.in_flight.waiting_since
-            # Of two round trips: TCP's may end at a proxy; and a broker without TCP_NODELAY holds an answer back until
-            # the one before it is acknowledged.
+            # The longer round trip, as TCP's may end at a proxy; and twice that, as a broker without TCP_NODELAY holds
+            # an answer back until the one before it is acknowledged.
             usual_s = 2 * max(round_trip_s, self.in_flight.round_trip_s)
             stalled_s = 0.0 if since is None else max(0.0, clock.since_boot() - since - usual_s)
             return Outgoing(waiting, round_trip_s, stalled_s)

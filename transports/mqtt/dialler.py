@@ -185,7 +185,7 @@ class Dialler:
     def failed(self, problem: str, held_s: float) -> tuple[str, bool]:
         """End the turn of the address, unless its broker will be asked once more in another way.
 
-        Return the problem in words (empty if there is none yet), and True if it is worth a line in the log.
+        ``held_s``: how long it was connected, or 0. Return the problem in words ("": none yet), and True to log it.
         """
         addresses, asks_again = self.addresses, self.limits.asks_again
         if self._is_last_attempt and not asks_again:

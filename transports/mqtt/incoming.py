@@ -97,10 +97,10 @@ class Incoming:
         if size and self.pings.is_thin:  # any sign of life counts: answers wait behind messages of others
             self.answered_at = clock.since_boot()
         is_inside_packet = size > 0 and self._packets == began_with  # bytes came, but no end of a packet
-        if age.has_retained or is_inside_packet:  # answers come only after these: the broker is not silent
+        if age.has_retained or is_inside_packet:  # the broker is not silent: answers come after these
             age.note_arriving()
         if not self.more:
-            age.waiting.empty(age.received_at)
+            age.waiting.empty(age.received_at)  # everything was read that had come by then
 
     def _read_piece(self, client: Client, now: float, most: int) -> int:
         """Read up to ``most`` packets from the bytes left over, or else from the socket; return how many bytes.
@@ -126,7 +126,7 @@ class Incoming:
 
     def _receive(self, client: Client, now: float) -> int:
         """Read once from the socket; return the number of bytes, from which the ages of messages are estimated."""
-        age, waiting = self.age, self.age.waiting
+        age, waiting = self.age, self.age.waiting  # waiting: since when bytes may have been in the socket
         age.received_at = now
         if now - waiting.checked_at > OVERSLEPT_S and self.accepted is not None:
             self.pings.send_after_stall(client, now)

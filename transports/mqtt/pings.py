@@ -46,10 +46,10 @@ class Pings:
 
     def send_after_stall(self, client: Client, now: float) -> None:
         """Send one ping after a time without reading: its answer comes after everything that waited at the broker."""
-        since = self._age.waiting.checked_at
+        since = self._age.waiting.checked_at  # nothing was read since then
         if since != self._stalled_since:
             self._stalled_since = since
-            self._in_flight.ping(now, None)
+            self._in_flight.ping(now, None)  # None: no caller waits for its answer
             self._age.delay.stalled(since, now)
             client.ping()
 

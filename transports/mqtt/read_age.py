@@ -67,7 +67,7 @@ class BrokerDelay:
 
     def __init__(self) -> None:
         self._pings: deque[_Ping] = deque()  # oldest first
-        self._read = self._delivered = 0.0, 0.0  # the newest answer: when its ping was sent, and how long it took
+        self._read_answer = self._delivered_answer = 0.0, 0.0  # when its ping was sent, and how long it took
         self._shortest = _FAR_S
         self._newest = 0.0  # seconds that the newest answer took; 0: it tells nothing
         self._came_at = 0.0  # when something was received last
@@ -92,7 +92,7 @@ class BrokerDelay:
         if self._pings:
             ping = self._pings.popleft()
             took_s = now - ping.sent_at
-            self._read = ping.sent_at, took_s
+            self._read_answer = ping.sent_at, took_s
             self._newest = took_s if ping.clear else 0.0  # else our own data held up the ping
             self.usual(took_s)
         is_near = self._shortest <= _NEAR_S  # else the answer to an older ping, too, may come soon after the newest one
@@ -112,11 +112,11 @@ class BrokerDelay:
 
     def delivered(self) -> None:
         """Note that all messages that were read have been delivered."""
-        self._delivered = self._read
+        self._delivered_answer = self._read_answer
 
     def delivery(self, now: float) -> tuple[float, float]:
         """Return the age of the newest ping with all messages before its answer delivered, and how late answers are."""
-        sent_at, took = self._delivered
+        sent_at, took = self._delivered_answer
         waits = now - self._pings[0].sent_at if self._pings else 0.0
         return now - sent_at, max(took, waits) - self._shortest
 

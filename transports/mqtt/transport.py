@@ -157,7 +157,7 @@ class MqttTransport(Transport):
                 return  # the next connection subscribes to them
             # Retained messages come after the SUBACK, on a bad network long after it; a ping's answer follows them.
             acks.append(connection.ping())
-        if self._network is None or threading.current_thread() is not self._network.thread:
+        if self._network is None or threading.current_thread() is not self._network.thread:  # which reads the answers
             deadline = time.monotonic() + _ANSWER_S
             for ack in acks:
                 ack.wait(deadline - time.monotonic())
@@ -193,7 +193,7 @@ class MqttTransport(Transport):
     # -- the network thread
 
     def _run(self, run: _Run) -> None:
-        failures, stopping = 0, run.stopping
+        failures, stopping = 0, run.stopping  # failures before the present one: after the first there is no pause
         while not stopping.is_set():
             began, problem = time.monotonic(), "failed unexpectedly"
             try:
@@ -217,7 +217,7 @@ class MqttTransport(Transport):
             if self._dialler.addresses.several and not self._dialler.addresses.is_over:
                 continue  # the next address
             pause = min(self.settings.reconnect_max_s, _RETRY_S * 2 ** (failures - 1)) if failures else 0.0
-            if not self._dialler.limits.asks_again:  # else the broker is asked in another way, and has not failed
+            if not self._dialler.limits.asks_again:  # a broker that is asked in another way has not failed
                 failures = min(failures + 1, 20)  # bounded, because it is an exponent
             stopping.wait(pause * random.uniform(0.5, 1.0))  # noqa: S311  (jitter, no secret)
 
@@ -233,14 +233,14 @@ class MqttTransport(Transport):
         """Run one connection from its start to its end. Raises Lost unless `close` has ended it."""
         self._dialler.begin()
         connection = self._dialler.connect(self, self.counters, run.stopping)
-        run.renewal = ""
+        run.renewal = ""  # if it was requested before, this connection is the new one
         connection.suit(thin=self.is_thin)
         try:
             if self.settings.as_published:
-                as_published = connection.incoming.as_published
-                if self.as_published and not as_published:
+                is_granted = connection.incoming.as_published
+                if self.as_published and not is_granted:
                     log.warning("%s has no bridge mode: own messages come back on this connection", connection.where)
-                self.as_published = self.exact_echo = as_published
+                self.as_published = self.exact_echo = is_granted
             self._serve(connection, run)
             self._finish(connection, run.will)
         finally:

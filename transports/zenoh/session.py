@@ -60,7 +60,7 @@ def _numbered(endpoint: str) -> str:
     name, bracket, port = rest.partition("]")
     try:
         return f"{start}%{socket.if_nametoindex(name)}]{port}" if zone and bracket else endpoint
-    except OSError:  # it is a number, or there is no such card, as Zenoh says
+    except OSError:  # it is a number already, or there is no such card, which Zenoh then reports
         return endpoint
 
 

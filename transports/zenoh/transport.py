@@ -161,9 +161,9 @@ class ZenohTransport(Transport):
         if self.settings.client and not self._start_client():
             return
         version = 0  # of the newest view that was handled
-        linked = 0  # the number of the hub connection that works; 0: none does
+        linked = 0  # the number of the hub connection that works; 0: none does, and with a hub it is tried again
         self._wait_for_siblings_once()
-        watch = self._hub.watch
+        watch = self._hub.watch  # of this run: it is closed at the end, and replaced when the transport opens again
         while (view := watch.wait(version, _RETRY_S if watch.hubs and not linked else None)) is not None:
             try:
                 linked = self._follow(view, version, linked)
@@ -236,7 +236,7 @@ class ZenohTransport(Transport):
             lacking = self._hub.greet(session, hello, remaining_s)
             if lacking is None:
                 return False
-            if not self._send_lacking(session, lacking - sent):  # it had no room for what it lacks again
+            if not self._send_lacking(session, lacking - sent):  # the hub has all, or no room for what was sent before
                 return True
             sent |= lacking
         return False

@@ -73,7 +73,8 @@ def wheels(
     check(wanted)
     results: list[Calibration] = []
     _run(config, lambda robot: results.append(calibrate(robot, _Terminal(), wanted)))
-    (result,), (left, right) = results, expected.step_mm
+    (result,) = results
+    left, right = expected.step_mm
     for name, value, expected_mm in (
         ("left step", result.left_step_mm, left),
         ("right step", result.right_step_mm, right),

@@ -110,9 +110,9 @@ class Legs:
         if start is not None:
             slow_mm_s = self._mm_s * _SLOW_POWER / POWER
             slow_s = way_mm / abs(turns) / slow_mm_s  # for a whole turn
-            late = f"it does not see tag {self._tag_id} again"
+            why_late = f"it does not see tag {self._tag_id} again"
             for direction in (side, -side):  # back, if it has rolled past
-                self._drive(name, (direction * _SLOW_POWER, 0.0), slow_s, lambda _: self._is_at(start), late)
+                self._drive(name, (direction * _SLOW_POWER, 0.0), slow_s, lambda _: self._is_at(start), why_late)
                 if self._sees():
                     break
         return _difference(began, self._counts())

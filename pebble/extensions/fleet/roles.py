@@ -102,7 +102,7 @@ _RIGHTS: Mapping[str, frozenset[Right]] = {
 }
 ROLES = tuple(_RIGHTS)
 _ALONE = frozenset(ProgramRole)  # roles that go with no other one, but for these two:
-_BOTH = {ProgramRole.PAGE, ProgramRole.EXPANDER}
+_GO_TOGETHER = {ProgramRole.PAGE, ProgramRole.EXPANDER}
 
 
 class Rule(NamedTuple):
@@ -170,7 +170,7 @@ def conflict(roles: Sequence[str]) -> str:
     for role in roles or ("",):  # an account without roles is refused as one with the role ""
         if role not in _RIGHTS:
             return f"{role!r} is no role: use {', '.join(ROLES)}"
-    if len(set(roles)) == 1 or set(roles) == _BOTH:
+    if len(set(roles)) == 1 or set(roles) == _GO_TOGETHER:
         return ""
     alone = [role for role in roles if role in _ALONE]
     return f"{alone[0]} goes with no other role" if alone else ""
@@ -204,15 +204,15 @@ def metrics(right: Right, extra: Extra | None = None) -> tuple[str, ...]:
     return (*(re.sub(r"{[^}]*}", "+", metric) for metric in declared), *getattr(extra, right, ()))
 
 
-def covered(right: Right, metric: str) -> str:
-    """Return a metric of the contract that the filter ``metric`` matches, but for which ``right`` is not enough.
+def covered(right: Right, filter_: str) -> str:
+    """Return a metric of the contract that ``filter_`` covers, but that ``right`` may not write.
 
-    Empty if there is none: then :class:`Extra` may grant ``metric`` to this right.
+    Empty if there is none: then :class:`Extra` may grant ``filter_`` to this right.
     """
     for channel in c.CHANNELS:
         if channel.direction == INCOMING and channel not in WRITES[right]:
             declared = re.sub(r"{[^}]*}", "+", channel.metric)
-            if any(_overlap(metric, filter_) for filter_ in (declared, f"{BY}/+/{declared}")):
+            if any(_overlap(filter_, other) for other in (declared, f"{BY}/+/{declared}")):
                 return channel.metric
     return ""
 
@@ -279,9 +279,10 @@ def _of_expander() -> Iterator[Rule]:
     for channel in c.CHANNELS:
         if channel.kind is Kind.STREAM and channel.remote and channel.bridged and channel is not c.STREAMS:
             yield Rule("write", channel.filter(_ANY))
+    # How groups are written, the groups, and announcements of expanders, also those with a name: only one may work.
     for suffix in (c.WIRE.suffix, c.STREAMS.suffix, c.EXPANDER.suffix, f"{INCOMING}/{BY}/+/{c.EXPANDER.metric}"):
         yield Rule("read", f"{_ANY}/{suffix}")
-    yield Rule("read", f"{c.SHORT}+")
+    yield Rule("read", f"{c.SHORT}+")  # the short topics of groups
 
 
 def _of_rights(

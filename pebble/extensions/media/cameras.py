@@ -74,7 +74,7 @@ class Camera:
             if frame is None:
                 raise DeviceError(f"no picture for {self._timeout:g} s from the camera in {self._run_dir}")
             picture = self._picture(frame)
-            if picture is not None:
+            if picture is not None:  # else the frame cannot be decoded: the next one is waited for
                 return picture
 
     def newest(self) -> Picture | None:

@@ -131,7 +131,11 @@ class JitterBuffer:
         self._make_room()
 
     def _is_old(self, number: int, captured_ms: int) -> bool:
-        """True if this packet was played or given up. If it was captured later, the sender has restarted: False."""
+        """True if this packet was played or given up.
+
+        False, and everything starts anew, if the sender has restarted: it was captured later than all packets so far,
+        or too many in a row seemed old.
+        """
         if self._expected is None or ahead(number, self._expected) >= 0:
             self._behind = 0
             return False

@@ -101,7 +101,7 @@ def _action_topic(op: m.ActionOp, channel: Channel, capabilities: dict[str, Any]
     for section in _sections(op):
         for key in ("flag_topic", "topic"):
             topic = section_of(capabilities, section).get(key)
-            if names(op.ref, topic, channel):
+            if names(op.ref, topic, channel):  # a topic of this component, and of no other channel
                 return str(topic)
     return channel.topic(op.ref)
 

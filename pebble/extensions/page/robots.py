@@ -291,7 +291,7 @@ class Robots:
 
     def _has_room(self, component: Component, metric: str, channel: c.Channel, more_bytes: int) -> bool:
         """True if a value may be stored. States of motor owners always may, as stop and control depend on them."""
-        if component.lists(metric):
+        if component.lists(metric):  # it is such a state
             return True
         is_new = metric not in component.values  # of channels that are no patterns there are few
         if is_new and len(component.values) >= MAX_METRICS and channel.is_pattern:

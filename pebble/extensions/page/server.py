@@ -240,7 +240,7 @@ class Server:
                 self.show_stops()
                 if now >= refresh_at:
                     refresh_at = now + _REFRESH_S
-                    self.robots.refresh(time.monotonic())
+                    self.robots.refresh(time.monotonic())  # the clock of the messages' arrival
                     self.boards.refresh(time.monotonic(), self.spawn)
                     self._show_broker()
             except Exception:  # later rounds must follow: the end of silent gestures depends on them

@@ -89,7 +89,7 @@ class PahoClient:
 
     def __init__(self, opening: Opening, listener: Listener, *, bridge: bool) -> None:
         client_id, settings, context, will, *_ = opening
-        self.drained = True
+        self.drained = True  # `receive` has emptied the socket
         self.hung_up = True  # so that a failed write counts as a hang-up: paho does not say why it failed
         self._settings, self._context, self._listener = settings, context, listener
         self._modern = settings.protocol == "5"
@@ -149,6 +149,7 @@ class PahoClient:
         if not data:
             self.hung_up = is_hang_up(error)
             self.close()
+        # With TLS the number of unpacked bytes does not tell whether the socket has more.
         self.drained = not data or (len(data) < _PIECE and self._context is None)
         self._paho.ahead, self._paho.begin = data, 0
         return len(data)

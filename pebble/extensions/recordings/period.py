@@ -78,7 +78,7 @@ def _until(text: str, since_ns: int | None, now: datetime) -> int:
         return _moment("--until", text, now, days=1)
     if since_ns is None:
         return _latest("--until", text, now)
-    # If ``now`` has no zone, drop the offset that astimezone adds: this machine's may change until the moment.
+    # Without a zone, drop the offset that astimezone adds: this machine's offset may change before ``moment``.
     since = (_EPOCH + timedelta(microseconds=since_ns // 1000)).astimezone(now.tzinfo).replace(tzinfo=now.tzinfo)
     moment = _time_of_day("--until", text, since)
     return _ns(moment if moment > since else moment + _DAY)

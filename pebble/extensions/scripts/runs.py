@@ -162,8 +162,8 @@ def _from_clock(wall_clock: Callable[[], float]) -> int:
 def _above(barred: int, *used: int) -> int:
     """Return the number after the newest of ``barred`` and ``used``; 0 stands for no number.
 
-    After the last number comes 1. So a number counts as older than ``barred`` if it is ahead by half of all numbers or
-    more. A used number is left out if the number after it would count as older than ``barred``.
+    The numbers form a circle: after the last one comes 1. From ``barred`` on, half of the circle counts as newer, the
+    other half as older. A used number is left out if the number after it is in the older half.
     """
     base = barred or newest(used)
     steps_ahead = [(run - base) & LAST_RUN for run in used if run and newer(following(run), base)]

@@ -76,9 +76,9 @@ class GroupGate:
     """A gate before a forwarder, for messages from outside. Messages that are no groups go on to :attr:`pass_on`.
 
     A group passes if each member would: it is published whole, and then a copy of each member by itself, for programs
-    that know no groups. Motor owners and described boards obey the whole: copies of the members for them are marked,
-    and of marked copies they obey only zeros. A group of which a member may not pass is dropped, except for members
-    that only end something. Marked copies from outside are refused: observers would see motion that is not there.
+    that know no groups. Motor owners and described boards obey the whole. The copies of their members are marked, and
+    of marked copies they obey only zeros. A group of which a member may not pass is dropped, except for members that
+    only end something. Marked copies from outside are refused: observers would see motion that is not there.
     """
 
     def __init__(self, forwarder: Forwarder, addresses: Addresses, note_drive: Callable[[bytes], None]) -> None:
@@ -89,6 +89,7 @@ class GroupGate:
     def receive(
         self, source: SideState, subject: Subject, message: Message, forward: Forward, account: str
     ) -> Forward | Drop:
+        """Take the place of :meth:`Forwarder.pass_now`; ``account``: the sender's, where names are checked."""
         if source.side is Side.REMOTE:
             if subject.channel is GROUP:
                 return self._receive_group(source, subject, message, forward, account)
@@ -134,7 +135,7 @@ class GroupGate:
         subject = self._subjects[topic]
         assert subject is not None  # noqa: S101 - its metric is that of a channel
         message = replace(message, topic=topic, payload=member.payload)
-        way = self._forwarder.admit(source, subject, message, topic, named=True)  # counted as messages with a name are
+        way = self._forwarder.admit(source, subject, message, topic, named=True)  # counted like those of an account
         if self._forwarder.stays(topic):
             way = Drop.STAYS
         if isinstance(way, Forward):

@@ -113,13 +113,16 @@ class LinkMeter:
         return self._shortest.seconds
 
     def follow(self, answer: Answer | None, now: float) -> None:
-        """Update the level by the newest answer, which counts once. A missing one counts again every half second."""
+        """Update the level by the newest answer, which counts once; one that is overdue counts every half second.
+
+        ``answer`` None: there is no connection.
+        """
         if answer is None:
             self.lost()
             return
         is_new = answer.number != self._answer_number
-        is_missing = answer.seconds > _UNANSWERED_S and now - self._answered_at >= _UNANSWERED_S
-        if is_new or is_missing:
+        is_overdue = answer.seconds > _UNANSWERED_S and now - self._answered_at >= _UNANSWERED_S
+        if is_new or is_overdue:
             self._answer_number, self._answered_at = answer.number, now
             self.answered(answer.seconds, now, answer.queue_s)
 

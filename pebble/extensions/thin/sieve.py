@@ -94,7 +94,7 @@ class Sieve:
     def due(self, rank: Rank) -> Iterator[Waiting]:
         """Yield the waiting messages of this rank that may be sent now. States wait while an event is overdue."""
         if rank is Rank.STATE and self._event_is_overdue:
-            if self._event_was_refused:  # it still waits, and new states have to wait, too
+            if self._event_was_refused:  # takes_event had no room for it: it still waits, and states wait behind it
                 self._event_was_refused = False
                 self._ranks_that_wait.add(rank)
                 return

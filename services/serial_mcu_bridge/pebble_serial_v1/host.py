@@ -124,7 +124,7 @@ class Session:
         self._by_id: dict[int, Interface] = {}
         self.known: OrderedDict[Hello, Manifest] = OrderedDict()
         self._commands: OrderedDict[int, _Command] = OrderedDict()  # without an answer yet; the first is due first
-        self._slots: dict[str, int] = {}  # number of the newest command, below WAITING: by interface, or "group"
+        self._slots: dict[str, int] = {}  # by interface, or "group": the newest command's slot, below WAITING
         self._sequence = 0
         self._ask_at: float | None = None  # when to ask for the manifest; None: it is known, or there is no line
         self._received_at = self._pinged_at = self._asked_at = float("-inf")

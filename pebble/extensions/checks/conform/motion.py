@@ -122,7 +122,7 @@ def at_the_wheel(robot: Observer, by: str = BY, answer_s: float = ANSWER_S) -> I
             robot.answers(lambda: driver.holds, answer_s)
         if driver.may_drive:
             driver.send()
-            robot.wait(lambda: moves_until(robot, time.monotonic()) != inf, ANSWER_S)
+            robot.wait(lambda: moves_until(robot, time.monotonic()) != inf, ANSWER_S)  # until it is not seen to move
         yield driver
     finally:
         if driver.may_drive:
@@ -260,11 +260,13 @@ def _clamped(robot: Observer, driver: Driver) -> CheckResult:
 def _foreign_key(robot: Observer, driver: Driver) -> CheckResult:
     """Check that commands with another's key move nothing, while someone has control and while nobody has."""
     why, fix = "it moves by another's key", "refuse what moves and has another key"
-    outcome = _moved(robot, driver.drive(key=_OTHER_KEY)[0], why, fix)
+    began, _ = driver.drive(key=_OTHER_KEY)
+    outcome = _moved(robot, began, why, fix)
     if outcome.state is not State.OK:
         return outcome
     driver.leaves()
-    return _moved(robot, driver.drive(DRIVES_S / 2, key=_OTHER_KEY)[0], f"{why} while no one has control", fix)
+    began, _ = driver.drive(DRIVES_S / 2, key=_OTHER_KEY)
+    return _moved(robot, began, f"{why} while no one has control", fix)
 
 
 def _control_passes(robot: Observer, driver: Driver) -> CheckResult:

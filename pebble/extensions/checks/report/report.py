@@ -74,6 +74,7 @@ def make(places: Places, file: Path | None = None) -> Report:
     here = _here(places, file or places.config)
     secrets = secrets_of(places, here.config, [here.file])
     report = Report(unread=secrets.unread)
+    # Stars replace the secrets that are known here, in any text, and words that look like passwords or tokens.
     for name, part in PARTS.items():
         try:
             report.parts[name] = secrets.hidden(without_secrets(part(here)))[:_LONGEST_PART]

@@ -82,7 +82,7 @@ class Gateway:
         self._first: dict[str, bytes] = {}  # by robot: its first heartbeat, which may be a retained one
         self._carried: dict[str, CarriedRobot] = {}
         self._has_begun = False
-        self._beginning = Beginning()
+        self._beginning = Beginning()  # measures each start of forwarding: commands wait at the broker meanwhile
         self._stop_cycles = Cycles(clock)
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
         self._lost = threading.Event()  # a connection was lost: begin again with every robot
@@ -198,7 +198,7 @@ class Gateway:
             transport.policy.is_stop = is_stop  # instead of the newest forwarder's, which knows its own robot
         self._has_begun = True
         self._carried |= {robot.base: robot for robot in robots}
-        with self._beginning:
+        with self._beginning:  # measures how long this takes
             begin(robots, hub, broker)
         log.info("carries %s", ", ".join(robot.base for robot in robots))
         if len(waiting) > TOGETHER:

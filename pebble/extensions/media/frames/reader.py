@@ -191,7 +191,7 @@ class FrameReader:
             self.counters.add("refused")
             return
         missed = self._missed(info)
-        if missed is None:
+        if missed is None:  # an old frame, by which nothing is lost
             return
         if missed:
             self.counters.add("missed", missed)

@@ -132,6 +132,7 @@ def put_account_into_topics(transport: Transport, names: Names, is_named: Callab
 
 
 def _of_config(config: Config, target: Target) -> tuple[str, Any, Names, str]:
+    """Return what :func:`resolve` does, for a robot's local transport or the broker that its bridge connects to."""
     base = config.base if target.robot is None else base_of(target.robot)
     addresses = Addresses(config) if base == config.base else None  # of another robot no renamed topics are known
     if target.remote:

@@ -243,7 +243,7 @@ class StopSender:
         """
         if not is_name(name):
             raise ValueError(f"{name!r} is not 16 hex digits")
-        _, by, why = stop_of({"by": by, "why": why})
+        _, by, why = stop_of({"by": by, "why": why})  # as motor owners read them: short printable ASCII
         payload = codec.encode(ESTOP, EstopCommand(stop=name, by=by, why=why))
         self.order = Order(name, payload, named=robots is not None, hold=hold, own_only=own_only)
         self.robots = {base: RobotStop(base, self.order, now) for base in (known if robots is None else robots)}

@@ -99,7 +99,7 @@ class RobotEstop:
 
         for channel in (ESTOP_STATE, CAPABILITIES):
             transport.subscribe(channel.filter(self.base), take, direct=True)
-        transport.ask(self.missing)
+        transport.ask(self.missing)  # some brokers send retained messages only to subscriptions of exact names
 
     def receive(self, message: Message) -> bool:
         """Update from a message of this robot; return False if it is malformed, or not about the stop."""

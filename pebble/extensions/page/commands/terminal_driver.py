@@ -71,13 +71,17 @@ class TerminalDriver:
             self.stop.receive(message, now)
 
     def press(self, keys: Sequence[str], now: float) -> None:
-        """Handle the keys that were read. Of keys for one axis the newest counts."""
+        """Handle the keys that were read. Of keys for one axis the newest counts.
+
+        ``!`` or Escape twice is an emergency stop. Space stops the robot, and ``l`` also releases control. ``t`` takes
+        control, or asks its holder for it; ``o`` takes it over without asking.
+        """
         for key in keys:
             if key == "!" or (key == ESCAPE and now - self._escape_at <= _TWICE_S):
                 self._begin_stop(now)
             elif key in (SPACE, "l"):
                 self.end(now, leave=key == "l")
-                self._out += self._driven.stop(now)
+                self._out += self._driven.stop(now)  # a zero, also if another person drives
             elif key in ("t", "o"):
                 self._take(now, over=key == "o")
             elif key in _AXES:
@@ -135,11 +139,11 @@ class TerminalDriver:
             motion = f"driving x {x:+.2f} z {z:+.2f}"
         parts = (
             self.name,
-            robot.itself,
+            robot.itself,  # that it drives itself, by a script
             motion,
             self.unconfirmed and f"EMERGENCY STOP NOT CONFIRMED: {self.unconfirmed}",
             f"{view.asks} asks for control: l lets {view.asks} drive" if view.you and view.asks else "",
-            *([] if view.you else self._failures),
+            *([] if view.you else self._failures),  # ``you``: this terminal has control
             "" if robot.volts is None else f"{robot.volts:.1f} V",
             "" if not robot.slow_s else f"slow connection: commands take {robot.slow_s:.1f} s",
             self._note,

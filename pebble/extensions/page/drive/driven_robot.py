@@ -187,8 +187,8 @@ class DrivenRobot:
         view = DriverView(keeps=self.keeps, asking=wish is not None and wish.client.wanted and not wish.client.held)
         if state is not None:
             asks = (state.asks or "somebody") if state.asks_id else ""
-            view = replace(view, asks=asks, checked=state.named, others=state.others)
-        if (other := self._held_elsewhere()) is not None:
+            view = replace(view, asks=asks, checked=state.named, others=state.others)  # named: the broker checks names
+        if (other := self._held_elsewhere()) is not None:  # the robot has given control to another server
             return replace(view, by=other.by, device=other.device)
         if self.tab is None:
             return view
@@ -391,7 +391,7 @@ class DrivenRobot:
         if tab.moves is self and op.g >= tab.gesture:
             self._on(Event.LETS_GO, now)
         commands = tab.interrupt(op.g, now)  # of another robot that the page moves
-        if self._is_assumed:
+        if self._is_assumed:  # while such a board connects anew, only a later zero stops it
             self._repeat_zeros(now)
         is_release = self.tab is tab and not op.final  # the driver has let go: an interrupted script may resume
         return [Command(self.ref, self._signed(ZERO) if is_release else FINAL_ZERO), *commands]
@@ -411,5 +411,6 @@ class DrivenRobot:
 
     @property
     def _is_assumed(self) -> bool:
+        """True for a silent board: what it can do is assumed, and no stop can latch it."""
         robot = self._view()
         return robot is not None and robot.is_assumed

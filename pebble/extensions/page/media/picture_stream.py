@@ -74,7 +74,7 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
         header = self._sequence.take(payload)
         if header is None:
             return
-        fits = self._sequence.complete  # with it: no picture before this one is missing
+        fits = self._sequence.complete  # no picture before this one is missing
         self._note(header.encoding, len(payload), now)
         self._extend_chain(payload, header, fits=fits)
         self._rescue.feed(payload, keyframe=header.keyframe)
@@ -84,6 +84,7 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
             self._skip(now)
 
     def _extend_chain(self, payload: bytes, header: PictureHeader, *, fits: bool) -> None:
+        """Add a picture to the chain, or begin or end it. ``fits``: no picture before this one is missing."""
         grown = self._chain_bytes + len(payload)
         if header.keyframe:
             self.key = KeyFrame(payload, time.monotonic())

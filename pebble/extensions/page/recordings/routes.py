@@ -164,12 +164,15 @@ class Recordings:
         return self.scratch / name
 
     def _is_old(self, timeline: _Timeline, paths: list[str], *, active: bool, again: bool) -> bool:
-        """True if the timeline must be made again from the present recordings."""
+        """True if the timeline must be made again from the present recordings.
+
+        ``active``: one of them is still being written. ``again``: make it again after a failure.
+        """
         if timeline.job.running:
             return False
         if timeline.job.why:
             return again or paths != timeline.paths
-        changed = paths != timeline.paths or timeline.active or active
+        changed = paths != timeline.paths or timeline.active or active  # active when it was made, or now
         return changed and clock() - timeline.began_at > _ACTIVE_S
 
     async def _forget(self) -> None:

@@ -79,7 +79,7 @@ class RecordingFile:
         self.path, self.damage = path, Damage()
         self.channels: dict[int, Channel] = {}
         self.chunks: list[Chunk] = []
-        self.is_ours = True  # written by Pebble, which numbers messages
+        self.is_ours = True  # written by Pebble, which numbers messages; also if a damaged header does not tell
         self.statistics: Statistics | None = None  # None: the file is not finished, or its summary is incomplete
         self._schemas: dict[int, Schema] = {}
         self._metadata: list[int] = []  # positions of these records

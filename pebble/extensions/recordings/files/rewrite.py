@@ -108,7 +108,7 @@ def _copy(source: Path, part: Path, keeps: Keeps, *, complete: bool) -> Rewritte
                 copy.add(message)
             else:
                 left_out += 1
-        damage, is_cut_off = file.damage, file.is_cut_off
+        damage, ends_as_after_kill = file.damage, file.is_cut_off
         if complete:
             _refuse_part(file)
         missing = damage.missing + missing_before(metadata)
@@ -116,8 +116,8 @@ def _copy(source: Path, part: Path, keeps: Keeps, *, complete: bool) -> Rewritte
             writer.metadata(DAMAGE, {MISSING: str(missing)})
         writer.finish()
         sync_file(out.fileno())
-    # Behind the last record a kill leaves nothing, zeros or part of a record: `is_cut_off`. Other bytes were not read.
-    is_whole = not (damage.parts or damage.missing or damage.unnamed) and is_cut_off
+    # Behind the last record a kill leaves nothing, zeros or part of a record. Other bytes there could not be read.
+    is_whole = not (damage.parts or damage.missing or damage.unnamed) and ends_as_after_kill
     return Rewritten(writer.messages, left_out, missing, damage.report(), is_whole)
 
 

@@ -54,8 +54,7 @@ class Due:
     def every(self, what: str, seconds: float) -> bool:
         """True if the task ``what`` is due: ``seconds`` have passed since it was due last.
 
-        The first time, it is due ``seconds`` after the first call for it, or at that call if this object is that old
-        already.
+        At the first call for it, the task is due if this object is that old already; otherwise ``seconds`` later.
         """
         now = self._boot_ns()
         if now - self._done.get(what, self._began) < seconds * 1e9:

@@ -140,7 +140,8 @@ class _RetainedFetch:
         self._record = record
         self._quiet_since = float("inf")  # not connected yet
         self._ends_at = time.monotonic() + _LONGEST_S
-        id_ = settings.client_id and f"{settings.client_id}-retained"  # without an id it has none either
+        id_ = settings.client_id and f"{settings.client_id}-retained"  # else None, as in ``settings``
+        # Without retain-as-published only old messages have the retain flag. For QoS 0 see :class:`Source`.
         plain = replace(settings, as_published=False, sends_retained=True, max_qos=0, client_id=id_)
         self._transport = create("mqtt", "pebble-recorder-retained", plain)
         self._transport.on_state(self._watch)

@@ -272,7 +272,7 @@ class Player:
     def _end(self) -> None:
         self._output.halt()
         if self._loop and self._begins_ns:
-            self._pass(_TICK_S)  # a recording may be one message
+            self._pass(_TICK_S)  # else a recording of one message would be sent without a pause
             self._open(self._begins_ns)
         elif self._stays:
             self.pause()

@@ -196,9 +196,9 @@ class Odometry:
         """Add a sample of the hall sensors."""
         self._samples += 1
         settings, (left, right) = self._settings, self._directions.at(now)
-        second = None if settings.second_channel == "none" else getattr(values, settings.second_channel)
+        left_second = None if settings.second_channel == "none" else getattr(values, settings.second_channel)
         left_value, right_value = getattr(values, settings.left_channel), getattr(values, settings.right_channel)
-        left_mm = self._left.update(HallSample(left_value, second, left.power, left.direction), now)
+        left_mm = self._left.update(HallSample(left_value, left_second, left.power, left.direction), now)
         right_mm = self._right.update(HallSample(right_value, None, right.power, right.direction), now)
         self._powered = left.power != 0.0 or right.power != 0.0
         self._move(left_mm, right_mm, now)

@@ -26,8 +26,8 @@ class Guard:
         self._reader, self._writer = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         signal.set_wakeup_fd(self._writer, warn_on_full_buffer=False)
         for number in _NUMBERS:
-            if signal.getsignal(number) is not signal.SIG_IGN:  # as a shell does for what runs in the background
-                signal.signal(number, _let_others_run)
+            if signal.getsignal(number) is not signal.SIG_IGN:  # a shell ignores it for what runs in the background
+                signal.signal(number, _let_guard_run)  # without a handler the signal would end the process at once
         os.register_at_fork(after_in_child=self._release)
         threading.Thread(target=self._run, name="pebble-end", daemon=True).start()
 
@@ -56,6 +56,6 @@ class Guard:
             signal.signal(number, signal.SIG_DFL)
 
 
-def _let_others_run(*_: object) -> None:
+def _let_guard_run(*_: object) -> None:
     """Pause the main thread if it runs Python: otherwise each step of the guard waits 5 ms for the global lock."""
     time.sleep(_PAUSE_S)

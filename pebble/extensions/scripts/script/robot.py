@@ -224,7 +224,7 @@ class Robot:
         self._wheels.end(why)
         for neighbour in list(self._neighbours.values()):
             neighbour.end()
-        locked = self._publishing.acquire(timeout=_STUCK_S)
+        locked = self._publishing.acquire(timeout=_STUCK_S)  # False: a publish hangs, and the end does without
         try:
             values, self._last_values = self._last_values, {}
             for channel, value in values.items():

@@ -86,7 +86,7 @@ class Wheels:
     def end(self, why: str) -> None:
         """Publish the final zero, and nothing after it."""
         self._over = True
-        locked = self._lock.acquire(timeout=_STUCK_S)  # the zero is sent even if another thread is stuck with it
+        locked = self._lock.acquire(timeout=_STUCK_S)  # False: a publish hangs, and the final zero does without
         try:
             self._sender.end(why, self._clock())
         finally:

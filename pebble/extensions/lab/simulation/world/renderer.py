@@ -145,8 +145,11 @@ class Renderer:
         self._cv2.fillConvexPoly(out, points, surface.colour, self._cv2.LINE_AA, _SHIFT)
 
     def _draw_texture(self, surface: Surface, me: RobotPose, plan: _Floats, out: Image) -> None:
-        """Draw a surface with its texture. Where its mask is not opaque, ``out`` keeps what is behind the surface."""
-        columns, rows = self._columns(plan), self._rows(surface, plan)
+        """Draw a surface with its texture; ``plan``: the edges of its visible part, by :meth:`_seen`.
+
+        Where its mask is not opaque, ``out`` keeps what is behind the surface.
+        """
+        columns, rows = self._columns(plan), self._rows(surface, plan)  # of each edge: its column, its two rows
         x0, x1 = max(0, math.floor(columns[0])), min(self._width, math.ceil(columns[1]) + 1)
         y0, y1 = max(0, math.floor(rows.min())), min(self._height, math.ceil(rows.max()) + 1)
         if x0 >= x1 or y0 >= y1:

@@ -42,7 +42,7 @@ class ViewerQueue:
     """The frames of either stream that wait for one page, and those sent and not yet acknowledged."""
 
     def __init__(self, can: frozenset[str], now: float) -> None:
-        self.can = can
+        self.can = can  # the encodings that the page says it can decode
         self.rescued = False  # it gets the rescue stream
         self.unserved = True  # it has received no picture, and no key frame was requested for it
         self.waiting = True  # for a key frame
