@@ -118,9 +118,9 @@ class SenderClocks(Generic[K]):
     def _clock_to_use(self, key: K, clock: _Clock, sent: float, now: float, late_s: float) -> _Clock:
         """Return the sender's clock, corrected if all its messages have seemed late for long enough."""
         if now - sent - clock.least <= late_s:
-            clock.other = None  # on time: the clock holds
+            clock.other = None  # on time: the clock was not changed
             return clock
-        candidate, patience = clock.other, self._patience
+        candidate, patience = clock.other, self._patience  # the candidate: the clock, if it was changed
         patience_s = patience.set_back_s if sent < clock.newest - _JUMP_S else patience.believed_s
         # A new candidate begins: if there was none, after a pause, or if less patience is due now.
         if candidate is None or now - candidate.received_at > patience.gap_s or patience_s < candidate.patience_s:

@@ -40,10 +40,10 @@ class EmergencyStop:
         self.stoppable = self.controllable = True  # the broker granted the topics of stops, and of control
         self._barred = 0  # of the last state
         self._paused = False  # a state was published less than _PAUSE_MS ago
-        self._since = now  # when
+        self._since = now  # when the last state was published
         self._unsaved = False  # there was a stop or a reset since the last `save`
         self._saves = True  # there is a file system that can be written to
-        self._saved: bool | None = False  # `latched` by the file; None: unknown
+        self._saved: bool | None = False  # whether the file says `latched`; None: unknown
         self._restore()
 
     def tick(self, now: int) -> None:

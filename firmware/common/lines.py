@@ -72,7 +72,7 @@ class Lines:
 
     def _end(self, length: int) -> None:
         line = self._line
-        at = _after(line, 0, length, True)
+        at = _after(line, 0, length, True)  # the blanks before the letter
         if at == length:
             return
         letter = line[at]
@@ -84,7 +84,7 @@ class Lines:
             return
         count = 0
         while count < _NUMBERS:
-            at = _after(line, _after(line, at, length, False), length, True)
+            at = _after(line, _after(line, at, length, False), length, True)  # the word after this one
             if at == length:
                 break
             self.numbers[count] = number(line, at, length)

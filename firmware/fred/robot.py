@@ -74,8 +74,8 @@ class Robot:
         self.port = Port(self.lines)
         self._sensors = [ADC(Pin(pin)) for pin in pins.SENSORS]
         self._charge = Pin(pins.CHARGE, Pin.IN, Pin.PULL_DOWN)
-        self._sensors_grid, self._fade_grid = Grid(_SENSORS_MS, now), Grid(_FADE_MS, now)
-        self._level = -1  # the light's brightness as set last; -1: set it in any case
+        self._sensors_grid, self._fade_grid = Grid(_SENSORS_MS, now), Grid(_FADE_MS, now)  # when they are due
+        self._level = -1  # of the light, as set last; -1: it has to be set
         self.lines.put(b"Starting setup...")
         self.lines.put(b"Done!")
 

@@ -133,7 +133,7 @@ class Client:
         """Queue a packet of these parts; False if there is no room now. One longer than ``out`` passes in pieces."""
         length = sum(map(len, parts))
         size = len(self.out)
-        if self._more or size - self.waiting < length + 3 <= size:
+        if self._more or size - self.waiting < length + 3 <= size:  # no room now; it fits once ``out`` is empty
             return False
         self._more.append(bytes((first, length)) if length < 128 else bytes((first, length & 127 | 128, length >> 7)))
         self._more.extend(parts)

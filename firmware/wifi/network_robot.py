@@ -57,8 +57,8 @@ class NetworkRobot:
         if hasattr(body, "groups"):
             topics += (b"group",)
         plain = len(topics)  # so many are subscribed to without an account
-        if names:  # without one: stops and zeros, if strangers are refused (2); else they may drive, and have control
-            plain = _DRIVE + 1 if strangers == 2 else _CONTROL + 1
+        if names:  # clients without one may stop, and send zeros; those that may drive may also have control
+            plain = _DRIVE + 1 if strangers == 2 else _CONTROL + 1  # 2: they are refused
         self.session = Session(settings, root, topics, plain, names, wrap, self._take)
         self.stops = EmergencyStop(now, _DRIVE_LIMIT_MS, strangers, names)
         self.deadman = DeadMan(_DRIVE_LIMIT_MS)

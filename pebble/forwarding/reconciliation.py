@@ -98,9 +98,9 @@ class Reconciliation:
         self._held = BoundedTable[bytes](TOPICS, BYTES, len)  # the loser's values, until the winner's have arrived
         self._published = {side: BoundedTable[bytes](TOPICS, BYTES, len) for side in Side}  # forwarded to each
         self._received: dict[Side, set[str]] = {side: set() for side in Side}  # since the connection began
-        # Of topics on which the winner has published nothing since its connection began, as far as has arrived:
-        self._offered: set[str] = set()  # the winner seemed to lack them, and was sent the loser's values
-        self._newer: set[str] = set()  # the loser has changed them after the winner's retained messages counted as here
+        # Topics on which nothing of the winner has arrived since its connection began:
+        self._offered: set[str] = set()  # those that the winner seemed to lack: it was sent the loser's values
+        self._newer: set[str] = set()  # changed by the loser after the winner's retained messages counted as received
         self._synchronized = dict.fromkeys(Side, False)
         self._overtaken: set[str] = set()  # changed by the loser while the winner was away
 
@@ -153,9 +153,9 @@ class Reconciliation:
                 self._newer.discard(topic)
                 self._offered.discard(topic)
             elif other_away and len(self._overtaken) < TOPICS:
-                self._overtaken.add(topic)  # what the winner brings back is older
+                self._overtaken.add(topic)  # the winner's value, when it returns, is older
             elif not retained and self._may_come_late(topic) and len(self._newer) < TOPICS:
-                self._newer.add(topic)  # what of the winner comes late is older
+                self._newer.add(topic)  # a value of the winner that still comes is older
             self._set(topic, payload, side)
         return resolution
 

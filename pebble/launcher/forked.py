@@ -40,7 +40,7 @@ def become(
         os.setpgid(0, 0)
         _arrange_descriptors(stdin, output, notes)
         _reset_signals()
-        _forget_launcher({**environment, NOTIFY_FD: str(_NOTES)})
+        _forget_launcher({**environment, NOTIFY_FD: str(_NOTES)})  # this becomes the child's environment
         hand_over(config)
         _run(program)
 

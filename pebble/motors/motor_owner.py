@@ -63,7 +63,7 @@ class MotorOwner(Service, ABC):
             watchdog_s=self.drive_timeout_s,
             now=self.clock(),
         )
-        self.on_stop(self.state_file.close)  # here, so that what start() adds is called before: a file may be slow
+        self.on_stop(self.state_file.close)  # first, so called after all that start() adds: a file may be slow
         self.on_stop(self._barred_file.close)
         self._deadline: Timer | None = None  # stops the motors unless a command arrives; None: they are stopped
         self._guard_timer: Timer | None = None

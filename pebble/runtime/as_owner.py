@@ -55,7 +55,7 @@ def require_own(folder: Path, does: str = "does not write there", *, there: bool
     """
     if not is_root():
         return
-    owner = owner_of(folder, nameless=False, there=there)
+    owner = owner_of(folder, nameless=False, there=there)  # users without a name, as in containers, do not count
     if owner.uid or is_open(folder):
         who = f"user {owner.uid}" if owner.uid else "all users"
         raise PebbleError(f"{folder} belongs to {who}, so root {does}: run it as that user, or name another folder")

@@ -62,7 +62,7 @@ class Inbox:
     def wait(self, timeout: float | None) -> None:
         """Wait for a job or for `wake`, up to ``timeout`` seconds."""
         if self:
-            return
+            return  # if it was woken as well, a later call returns for that
         end = None if timeout is None else time.monotonic() + timeout
         while not (self or self._woken):
             if not self._wakeup.wait(end):

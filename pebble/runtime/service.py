@@ -322,7 +322,7 @@ class Service:
 
         if channel.newest:
             self._inbox.post(handle, newest_of=message.topic)
-        else:  # what ends something has a name, because jobs with one are dropped last; it runs after earlier commands
+        else:  # what ends something gets a name, as named jobs are dropped last; it runs after earlier commands
             self._inbox.post(handle, last_of=message.topic if channel.ends(value) else None)
 
     def _remark(self, channel: Channel, sender: str, text: str) -> None:

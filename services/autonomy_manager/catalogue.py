@@ -68,7 +68,7 @@ class _Answer(NamedTuple):
     problem: str = ""
     broken: bool = False
     asked: bool = True  # False: what it says itself is not known yet
-    measures: bool = False  # it only measures: it says itself that it never drives
+    drives: bool = True  # False: it says itself that it only measures, and never drives
 
 
 class Catalogue:
@@ -159,7 +159,7 @@ class Catalogue:
             broken=answer.problem if answer.broken else "",
             asked=answer.asked,
             own_program=bool(described.command),
-            drives=not answer.measures,
+            drives=answer.drives,
         )
 
     def _answer(self, name: str, folder: Path, entry: Path, section: ScriptSection, *, asks: bool) -> _Answer:
@@ -208,7 +208,7 @@ class Catalogue:
         command = self._command(folder, entry, section, described, ours=True)
         try:
             answer = ask(command, folder, environment(section.env))
-            return _Answer(_merged(described, answer), True, problem, measures=not answer.drives)
+            return _Answer(_merged(described, answer), True, problem, drives=answer.drives)
         except DescribeError as error:
             return _Answer(described, True, str(error), isinstance(error, BrokenScriptError))
 

@@ -49,12 +49,12 @@ def facts(config: Config) -> Facts:
 def _fitness(config: Config, script: Script) -> str:
     if script.broken:
         return f"does not run: {script.broken}"
-    if script.ours:
+    if script.ours:  # it uses pebble.script
         return "runs, Pebble's own"
     from pebble.services.autonomy_manager.environment import environment
     from pebble.services.autonomy_manager.interpreter import lacking
 
-    is_probed = not script.own_program and _may_run(config, script)
+    is_probed = not script.own_program and _may_run(config, script)  # what its script.json names may be no Python
     missing = lacking(script.command, script.folder, environment(ours=False)) if is_probed else []
     return f"runs with {script.command[0]}" + (f", which lacks {', '.join(missing)}" if missing else "")
 

@@ -36,15 +36,15 @@ class Guard:
     """
 
     def __init__(self, lock: Path) -> None:
-        self._path, self._locked = lock, -1
+        self._path, self._descriptor = lock, -1  # of the lock while this process has it open, else -1
 
     def begin(self) -> None:
         """Wait until the guard of an earlier process has ended. Raises PebbleError if it does not."""
-        if self._locked >= 0:
+        if self._descriptor >= 0:
             return
         try:
             self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            self._locked = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC, 0o600)
+            self._descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC, 0o600)
         except OSError as error:
             log.warning("%s cannot be opened: %s", self._path, error.strerror)
             return
@@ -67,7 +67,7 @@ class Guard:
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             start_new_session=True,  # a kill of this process's group must not reach it
-            pass_fds=() if self._locked < 0 else (self._locked,),
+            pass_fds=() if self._descriptor < 0 else (self._descriptor,),
         )
 
         def call_off() -> None:
@@ -78,13 +78,13 @@ class Guard:
 
     def close(self) -> None:
         """Let the next manager start, once no script is left."""
-        if self._locked >= 0:
-            os.close(self._locked)
-            self._locked = -1
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
 
     def _try_to_lock(self) -> bool:
         try:
-            fcntl.flock(self._locked, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             return False
         except OSError as error:  # a file system without locks

@@ -107,9 +107,10 @@ class Capturer:
 
     def _write(self, capture: Capture) -> tuple[FrameInfo, int | str | None]:
         """Write a frame; return its metadata, and its content for the check of the device's health."""
+        # A frame that has still to be drawn is drawn into shared memory, if there is room for it.
         slot = self._writer.slot(capture.size) if capture.draw is not None else None
-        pixels = capture.pixels(self._room(capture) if slot is None else slot.array)
-        info, content = _as_it_is(capture.info, pixels), _content(capture.info, pixels)
+        pixels = capture.pixels(self._scratch_for(capture) if slot is None else slot.array)
+        info, content = _with_real_size(capture.info, pixels), _content(capture.info, pixels)
         if self._ended.is_set():  # the device answered after another thread had taken over
             return info, None
         if slot is None:
@@ -118,7 +119,7 @@ class Capturer:
             slot.send(_stamped(capture, info))
         return info, content
 
-    def _room(self, capture: Capture) -> Bytes:
+    def _scratch_for(self, capture: Capture) -> Bytes:
         if capture.draw is not None and len(self._scratch) != capture.size:
             self._scratch = np.empty(capture.size, np.uint8)
         return self._scratch
@@ -131,7 +132,7 @@ class Capturer:
         self._ended.wait(delay)
 
 
-def _as_it_is(info: FrameInfo, data: Bytes) -> FrameInfo:
+def _with_real_size(info: FrameInfo, data: Bytes) -> FrameInfo:
     """Return ``info`` with the size in the JPEG itself, which may differ from the requested size."""
     if info.format != "mjpeg":
         return info

@@ -77,7 +77,7 @@ class RateController:
             self._counters.add("held_back")
             return False
         missed = self._selector.use(captured_s)
-        if self._blocked:  # else the camera was late
+        if self._blocked:  # else turns were missed because the camera was late
             self._levels.lost(missed, now)
         self._blocked = False
         return True

@@ -35,7 +35,7 @@ class HomeAssistantService(Service):
         self._sent_at = float("-inf")
         self._file = saved(self.config)
         self._retained = self._load()  # topics that the broker may retain
-        self._emptied: set[str] = set()  # topics, on this connection, perhaps not confirmed
+        self._emptied: set[str] = set()  # topics that got an empty message on this connection; it may not be confirmed
 
     def start(self) -> None:
         self._remote.on_state(lambda state: self.post(self._on_connection) if state is State.CONNECTED else None)

@@ -71,7 +71,7 @@ class Owner:
                 self.withdrawn_at = now
             return
         self.withdrawn_at = None
-        # A restart proves no reset: the file may be older than the stop.
+        # A restart proves no reset: its file may be older than the stop. A greater count: stopped between the states.
         was_stopped = (
             earlier is not None and earlier.boot == state.boot and (earlier.latched or state.count > earlier.count)
         )

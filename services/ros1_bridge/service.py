@@ -82,14 +82,14 @@ class Ros1Bridge(Ros1Reader, MotorOwner):
         ros = self.section.ros
         self._lock_file = StateFile(self.config.state_file(f"lock-{self.owner}"))
         self._reported = Reported(self.notifier.mcu)
-        self._shown: object = None
+        self._shown: object = None  # the report of the base that was logged last
         self.cmd_vel = CmdVel(
             self.node,
             ros.cmd_vel_topic,
             ros.cmd_vel_publish_interval_seconds,
             None if ros.estop_topic == NONE else ros.estop_topic,
             None if ros.cancel_topic == NONE else ros.cancel_topic,
-            owed=self._lock_file.load() not in (None, False),  # a file that cannot be read counts as a lock
+            owed=self._lock_file.load() not in (None, False),  # to unlock it: an unreadable file counts as a lock
             save=self._lock_file.save,
         )
 

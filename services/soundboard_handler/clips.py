@@ -84,7 +84,7 @@ class Clips:
         except OSError:  # too long
             return None
         inside = path.relative_to(root).as_posix()
-        return Clip(inside if is_text(inside) else name, path)  # else the name of a link to it
+        return Clip(inside if is_text(inside) else name, path)  # ``name`` is then that of a link to this file
 
     def _paths(self) -> Iterator[str]:
         """Return the paths of all clips, as the folder has them."""

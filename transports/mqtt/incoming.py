@@ -78,7 +78,7 @@ class Incoming:
         if self.accepted is None:
             return  # `connect` has its own deadline, and gives the first round trip
         silence_s = now - max(self.answered_at, self.age.arriving_at)
-        if silence_s > self.silence_s and silence_s > (limit := self.pings.silence_limit_s):  # at least as long
+        if silence_s > self.silence_s and silence_s > (limit := self.pings.silence_limit_s):  # at least self.silence_s
             self._counters.add("silences")
             raise Silent(f"{self.where} has not answered for {limit:.1f} s")
 

@@ -20,13 +20,13 @@ class Pings:
 
     def __init__(self, settings: MqttSettings, in_flight: InFlightTable, age: ReadAge) -> None:
         self._in_flight, self._age = in_flight, age
-        self._silence_s = max(settings.silence_s, 4 * _LEAST_S)
+        self._silence_s = max(settings.silence_s, 4 * _LEAST_S)  # time for four pings
         keepalive_s = settings.keepalive_s or inf  # 0: the broker sets no limit
         self._interval_s = max(_LEAST_S, min(settings.silence_s, keepalive_s) / 4)
         self._thin_interval_s = min(_THIN_INTERVAL_S, keepalive_s / 2)
         self.is_thin = False  # see `Transport.is_thin`
         self.due_at = inf  # once accepted they are sent regularly: other answers come only to what we publish
-        #: The beginning of the last time without reading for which a ping was sent.
+        #: Since when nothing had been read when :meth:`send_after_stall` sent its last ping: one for each stall.
         self._stalled_since = age.waiting.checked_at
 
     def begin(self, now: float) -> None:

@@ -69,7 +69,7 @@ class BrokerDelay:
         self._pings: deque[_Ping] = deque()  # oldest first
         self._read_answer = self._delivered_answer = 0.0, 0.0  # when its ping was sent, and how long it took
         self._shortest = _FAR_S
-        self._newest = 0.0  # seconds until the newest answer
+        self._newest = 0.0  # seconds that the newest answer took; 0: it tells nothing
         self._came_at = 0.0  # when something was received last
         self._stall = 0.0  # seconds for which the broker stood still; messages count as having waited so long
         self._until = 0.0  # until this time
@@ -93,7 +93,7 @@ class BrokerDelay:
             ping = self._pings.popleft()
             took_s = now - ping.sent_at
             self._read_answer = ping.sent_at, took_s
-            self._newest = took_s if ping.clear else 0.0
+            self._newest = took_s if ping.clear else 0.0  # else our own data held up the ping
             self.usual(took_s)
         is_near = self._shortest <= _NEAR_S  # else the answer to an older ping, too, may come soon after the newest one
         if is_near and self._pings and now - self._pings[-1].sent_at <= self._shortest + _NEAR_S:

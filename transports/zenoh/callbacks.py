@@ -114,7 +114,7 @@ class Guard:
         for calls in self._calls:
             begun, runs = calls.begun, calls.begun != calls.ended
             active = active or runs or begun != calls.begun_before
-            if runs and calls.ran:  # the same one, or many without a pause
+            if runs and calls.ran:  # at both looks: one that takes long, or many without a pause
                 self._help()
             self._suspects = self._suspects or runs
             calls.begun_before, calls.ran = begun, runs

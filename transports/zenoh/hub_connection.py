@@ -27,9 +27,9 @@ class HubConnection:
     def __init__(
         self, client_id: str, will: Message | None, own: OwnRetained, count: Callable[[], object], account: str
     ) -> None:
-        self._account = account
+        self._account = account  # under which the hub knows this client; "": a process of this machine
         self._will = None if will is None else wire.Will.of(will, client_id)
-        self._own, self._count_received = own, count
+        self._own, self._count_received = own, count  # ``count()`` counts a message that was received
         # Retained topics we have removed, in case a hub that was ending did not receive the removal.
         self._removed: dict[str, None] = {}
         self.retained_count = 0  # of retained messages published so far

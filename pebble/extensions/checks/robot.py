@@ -151,7 +151,7 @@ def brokers(config: Config) -> Iterator[CheckResult]:
         settings = mqtt_settings(mqtt, reconnect_max_s=REMOTE_RECONNECT_S, program="doctor")
         results = list(broker(name, settings, level, max(TIMEOUT_S, answer_s)))
         yield from results
-        if is_remote and results[0].state is State.OK:
+        if is_remote and results[0].state is State.OK:  # the first is that of the login
             yield from robot_account(results[0].what, settings, config.base, answer_s, level)
         if is_loopback(settings.host):
             yield from beyond_loopback(name, settings, own_addresses())
@@ -166,7 +166,7 @@ def page_brokers(config: Config) -> Iterator[CheckResult]:
     results = list(broker("page's broker", settings, level))
     yield from results
     if not any(result.state is State.FAILED for result in results):
-        yield from page_account(results[0].what, settings, level)
+        yield from page_account(results[0].what, settings, level)  # all results name the broker with its address
 
 
 def extensions(config: Config) -> Iterator[CheckResult]:

@@ -106,8 +106,9 @@ class Audit(Observer):
             if row_of is not None:
                 command = codec.decode(channel, payload)
                 row, who = row_of(command), _sender(by, command)
+                most_different = OF_STRANGERS if channel in _MILD else DIFFERENT  # in a minute
                 if row and not self._noted_before(row, who):
-                    self.note(who=who, most=OF_STRANGERS if channel in _MILD else DIFFERENT, **_place(by), **row)
+                    self.note(who=who, most=most_different, **_place(by), **row)
             else:
                 on = bool(payload) and bool(codec.decode(channel, payload))
                 if on or channel.kind is Kind.FLAG:  # an action that is not "on" does nothing

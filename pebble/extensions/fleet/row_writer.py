@@ -55,7 +55,7 @@ class RowWriter:
         ``like``: a key that similar rows share; None: all fields but the time. Once the window has ``most`` keys, rows
         with further ones are stored as their kind alone, so that they are similar to each other.
         """
-        key = (tuple(row.items())[1:],) if like is None else like  # the row without its time
+        key = tuple(row.items())[1:] if like is None else like  # the row without its time, the first item
         now = self._clock()
         with self._lock:
             if now - self._since >= WINDOW_S:

@@ -213,7 +213,8 @@ class Control:
         """Publish a command to a robot, once. It is not repeated; the robot's states show its effect."""
         if not self._may(robot_commands.right(op), op):
             return
-        if why := (self._why_not if robot_commands.moves(op) else "") or self._server.drivers.refusals.of_op(op):
+        why_not = self._why_not if robot_commands.moves(op) else ""
+        if why := why_not or self._server.drivers.refusals.of_op(op):
             self._refuse(op, why)
             return
         if not self._publish(op, robot_commands.publication(op, self._server.robots.capabilities(op.ref))):

@@ -65,7 +65,7 @@ def refusal(op: m.RobotOp, capabilities: dict[str, Any]) -> str:
         offer = _outlet_offer(capabilities, op.outlet)
     else:
         offer = section_of(capabilities, section)
-    # the third key is for one kind of command: lights that do not flash have {"solid": true, "flash": false}
+    # Lights that do not flash have {"solid": true, "flash": false}: the key is that of the topic, "flash_topic".
     refusing_keys = ("available", "controls", key.removesuffix("_topic"))
     if not any(offer.get(refusing_key) is False for refusing_key in refusing_keys):
         return ""

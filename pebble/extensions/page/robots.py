@@ -255,9 +255,9 @@ class Robots:
         opened = {interest.watched for interest in self.interests}
         turn_s = max(_REFRESH_S, len(self.components) / _REFRESHES_PER_S)
         for component in self.components.values():
-            waited_s = now - component.refreshed_at
+            waited_s = now - component.refreshed_at  # infinite: nothing was sent yet
             changed = component.robot.online(now) is not component.sent_online or waited_s == float("inf")
-            has_ages = component.robot.live or component.sent_online is not None
+            has_ages = component.robot.live or component.sent_online is not None  # else no age is known
             is_open = component.ref in opened
             if changed or (has_ages and is_open and waited_s >= _REFRESH_S):
                 self._refresh(component, now)

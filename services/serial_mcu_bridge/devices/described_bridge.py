@@ -80,7 +80,7 @@ class DescribedBridge(SerialService):
         self._session = Session(self.config.base)
         self.watchdog = ImuWatchdog(self.options, self.instance)
         self._peers = PeerDevices()
-        self._token = secrets.token_hex(8)  # of our _UID_QUERY; one for our uid with another token is a second device's
+        self._token = secrets.token_hex(8)  # of our question about our uid: another token is from a second device
         self._conflict_logged = False  # another device has the same uid
         self.device: Device | None = None
         self._published_states: dict[int, tuple[Reading, int]] = {}  # newest of each state interface, its epoch ms
@@ -165,7 +165,8 @@ class DescribedBridge(SerialService):
     def _report(self, reading: Reading) -> None:
         device, now_ms = self.device, _now_ms()
         is_motion = reading.interface.profile == MOTION
-        if device is None or not device.has_motion or is_motion:  # other readings go on if the inertial sensor fails
+        has_motion = device is not None and device.has_motion
+        if is_motion or not has_motion:  # others go on if the inertial sensor fails
             self.watchdog.sample(self.clock())
         if is_motion:
             self.sensors.take(measured(reading.values), self.clock())

@@ -15,7 +15,7 @@ from pebble.transports import Message
 
 _DEVICES = 256  # remembered; a robot has a handful
 _WAITING = 256  # retained values that wait for a list
-_QUESTION, _LIST = ("/" + channel.metric.rpartition("/")[2] for channel in (MCU_DESCRIBE, MCU_LOCAL_ONLY))
+_DESCRIBE, _LIST = ("/" + channel.metric.rpartition("/")[2] for channel in (MCU_DESCRIBE, MCU_LOCAL_ONLY))
 _MARK = b'"device_uid"'  # in every value under an alias: the MCU it belongs to
 
 
@@ -35,7 +35,7 @@ class LocalOnly(PrivateTopics):
         """True if ``topic`` is on a list, is a command to an MCU without a list, or a request for a manifest."""
         if topic.startswith(self._commands):
             uid = topic.removeprefix(self._commands).partition("/")[0]
-            if uid not in self._listed or topic.endswith(_QUESTION):
+            if uid not in self._listed or topic.endswith(_DESCRIBE):
                 return True
         return bool(self._private) and any(topic in topics for topics in list(self._private.values()))
 
@@ -81,8 +81,8 @@ class LocalOnly(PrivateTopics):
         """Return the uid of the MCU whose value this is; None for a manifest, or another program's message."""
         if message.topic.startswith(self._values):
             uid = message.topic.removeprefix(self._values).partition("/")[0]
-            return None if message.topic.endswith(_QUESTION) else uid
-        sample = _object(message.payload) if _MARK in message.payload else {}  # under an alias
+            return None if message.topic.endswith(_DESCRIBE) else uid
+        sample = _object(message.payload) if _MARK in message.payload else {}  # of an alias: the uid is inside
         sender = sample.get("device_uid")
         return sender if isinstance(sender, str) and isinstance(sample.get("interface"), str) else None
 

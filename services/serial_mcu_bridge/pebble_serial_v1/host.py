@@ -214,7 +214,7 @@ class Session:
             case Type.HELLO:
                 yield from self._hello(parse_hello(frame.payload), now)
             case Type.DESCRIBE:
-                yield from self._describe(parse_describe(frame.payload, self._base))
+                yield from self._take_manifest(parse_describe(frame.payload, self._base))
             case Type.SAMPLE | Type.STATE:
                 yield from self._reading(frame, now)
             case Type.ACK | Type.NACK:
@@ -237,13 +237,14 @@ class Session:
         else:  # a repeated HELLO does not delay the request
             self._ask_at = min(now + ASK_AFTER_HELLO_S, self._ask_at or float("inf"))
 
-    def _describe(self, manifest: Manifest) -> Iterator[Event]:
+    def _take_manifest(self, manifest: Manifest) -> Iterator[Event]:
+        """Remember a manifest that was received, and begin with it unless it is the present one."""
         self.known[manifest.hello] = manifest
         self.known.move_to_end(manifest.hello)
         if len(self.known) > _REMEMBERED:
             self.known.popitem(last=False)
         if manifest == self.manifest:
-            self._ask_at = None
+            self._ask_at = None  # nothing has changed, so the doubt is over
             return
         yield from self._forget("its manifest differs")
         yield from self._begin(Described(manifest))

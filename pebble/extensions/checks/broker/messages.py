@@ -156,8 +156,9 @@ def held_back(trial: BrokerTrial, reader: Peer, writer: Peer, topic: str) -> Che
         pair = _pair(trial, reader, writer, topic)
         if pair is None:
             return failed("they are lost on an idle connection", OTHER)
-        round_trips_s.append(pair[0])
-        gaps_s.append(pair[1])
+        round_trip_s, gap_s = pair
+        round_trips_s.append(round_trip_s)
+        gaps_s.append(gap_s)
     late_s = median(gaps_s)
     if late_s < max(_HELD_S, _HELD_ROUND_TRIPS * min(round_trips_s)):
         return ok("are passed on at once")

@@ -276,7 +276,8 @@ def _scripts(config: Config) -> list[tuple[str, str]]:
 def _shared_broker(config: Config) -> Mqtt | None:
     """Return the broker that other programs, too, may use to reach the robot's own processes; None if there is none.
 
-    With Zenoh inside it is that of the mirror. With MQTT it is the local one; None if operators have another one.
+    With Zenoh inside it is that of the mirror. With MQTT it is the local one, if operators use that as well; without
+    a bridge in any case.
     """
     if config.transport.kind != "mqtt":
         return config.transport.mqtt_mirror

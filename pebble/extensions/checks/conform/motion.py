@@ -270,6 +270,7 @@ def _foreign_key(robot: Observer, driver: Driver) -> CheckResult:
 
 
 def _control_passes(robot: Observer, driver: Driver) -> CheckResult:
+    """Check that the robot rests once another takes control, although the former driver goes on with its key."""
     began, _ = driver.drive()
     key, second = driver.key, Driver(robot)
     taken_at = second.takes()

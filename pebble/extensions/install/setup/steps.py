@@ -231,7 +231,7 @@ class Job:
             with as_owner(file.parent), closing(People(file)) as people:
                 people.add(str(name), self.secrets.password or "", Role.ADMIN)
 
-        yield Step(f"{name} may log in at the page, as admin", lambda: has_user(file, str(name)), add, ())
+        yield Step(f"{name} may log in at the page, as admin", lambda: has_user(file, str(name)), add, restarts=())
 
     def _config(self) -> Step:
         """Return the step that writes the config, with a copy of the earlier one beside it."""

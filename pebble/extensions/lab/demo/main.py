@@ -126,7 +126,8 @@ class Demo:
         testbed.start_recorder(recordings, *_RECORDED)
         has_visitors = self._seconds is None  # a timed demo has none: no camera is shown in turn
         settings = {"cameras_in_turn": has_visitors, **({} if phone is None else phone.settings)}
-        self._page_url = usual_or_free(testbed, self._ending, recordings=recordings, **settings).url
+        page = usual_or_free(testbed, self._ending, recordings=recordings, **settings)  # at its usual port, if free
+        self._page_url = page.url
         print_line(console, f"See and drive them in a browser: {self._page_url}")
         print_line(console, f"Its Recordings show what they do, from {recordings}, which the demo deletes at its end.")
         if phone is not None:

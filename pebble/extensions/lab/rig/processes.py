@@ -302,6 +302,7 @@ def children(pid: int) -> list[int]:
     pids = []
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
-            if int((process / "stat").read_text().rpartition(")")[2].split()[1]) == pid:
+            _state, parent, *_ = (process / "stat").read_text().rpartition(")")[2].split()  # what follows the name
+            if int(parent) == pid:
                 pids.append(int(process.name))
     return sorted(pids)

@@ -75,7 +75,7 @@ def array(buffer: Buffer, size: int, *, writable: bool = False, owner: object = 
     A `ZShmMut` that was sent does not own its bytes any more: ``owner`` must then be the provider, so that the memory
     stays mapped.
     """
-    if self_test.test() or self_test.offset is None:
+    if self_test.test() or self_test.offset is None:  # the test returns the problem, if there is one
         return None
     return _array(buffer, size, self_test.offset, writable=writable, owner=owner)
 

@@ -216,6 +216,7 @@ class FrameWriter:
         return None if chunk is None else Slot(self, chunk)
 
     def _is_wanted(self) -> bool:
+        """True if the stream is open and has readers. A frame without readers is counted as unwanted."""
         if self._publishers is None:
             return False
         check_process(self._pid)

@@ -65,12 +65,12 @@ class RobotStop:
         self.live = False  # anything but retained messages has arrived from it
         self.driveable: Driveable | None = None  # as its status says
         self.confirmed_s: float | None = None  # how long it took; None: it is not confirmed
-        self.next: float = now  # when to send again, unless it is confirmed or spared
+        self.next: float = now  # when to send again, while :attr:`sending`
         self._order, self._began = order, now
         self._sent_at = float("-inf")
         self._script_ended = False  # the end of a script was sent
         self._given_up = False
-        self._names_due = False  # it was sent before it was known that the robot reads topics with a name
+        self._names_due = False  # due again: after it was sent, capabilities came by which topics name the sender
         self._status_topic, self._online_topic = STATUS.topic(base), ONLINE.topic(base)
         self._is_offline = False  # as the newest retained heartbeat says
         self.stamp = 0.0  # the newest stamp of the messages that its broker retains, in epoch seconds
@@ -79,7 +79,7 @@ class RobotStop:
 
     @property
     def progress(self) -> Progress:
-        """Return how far the robot's stop has got."""
+        """Return how far the robot's stop has got. A robot that its sender names is never spared."""
         if self.confirmed_s is not None:
             return Progress.CONFIRMED
         if self.estop.has_capabilities and not (self.estop.available or self.estop.drives or self._order.named):

@@ -191,7 +191,7 @@ class Drivers:
         """Publish a command that moves a robot, in a group with the robot's lights if some wait for it."""
         ref, lights = command.ref, self._lights.get(command.ref)
         topic = self._robots.topic(ref, DRIVE)
-        if lights is not None and lights.grouped_at == inf:
+        if lights is not None and lights.grouped_at == inf:  # they wait for a command
             topic, payload = GROUP.topic(ref), joined({DRIVE.metric: payload, lights.metric: lights.message.payload})
             self._lights[ref] = lights._replace(grouped_at=clock())
             self._grouped.add(ref)

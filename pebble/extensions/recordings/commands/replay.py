@@ -93,11 +93,11 @@ def replay(
 
 
 def _read(recordings: list[Path], options: Options) -> tuple[ReplaySource, Rules]:
-    """Return the recording to replay. Raises PebbleError if it has no messages to replay."""
+    """Return the recording to replay, and its rules. Raises PebbleError if it has no messages to replay."""
     source = ReplaySource(files(recordings))
     topics = {channel.topic for channel in source.channels if not channel.topic.startswith("$")}
     rules = Rules(options, source.channels)
-    if not problems(source.damages):
+    if not problems(source.damages):  # else it may have topics that cannot be read
         for filter_ in options.only:
             if not any(matches(filter_, topic) for topic in topics):
                 check_name("topic", filter_, topics, recordings)

@@ -174,7 +174,7 @@ class Telemetry:
 
     def convert(self, topic: str, payload: bytes) -> Converted | None:
         """Return the converted payload; None if it is to stay as it is, also if it does not fit its channel."""
-        below_base = "".join(topic.split("/", 3)[3:])
+        below_base = "".join(topic.split("/", 3)[3:])  # empty if there are only three levels
         channel = channel_of(below_base) if below_base.startswith((c.INCOMING, c.OUTGOING)) else None
         convert = None if channel is None else self._converters.get(channel)
         if convert is None:

@@ -40,7 +40,7 @@ class RecordingWriter:
         self._named: list[Channel] = []  # that were declared before the last flush
         self._new: list[Channel] = []  # that were declared since then
         self._used: set[int] = set()  # channels with messages since then
-        self._log_ns = self._names_again_ns = 0
+        self._log_ns = self._names_again_ns = 0  # of the newest message; when all channels are declared again
         self._writer.start(library=library)
 
     @property

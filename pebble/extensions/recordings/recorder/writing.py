@@ -124,7 +124,7 @@ class Writing:
         try:
             file.add(item, at_ns)
         except OSError as error:
-            self._fail(lane, error)
+            self._fail(lane, error)  # it keeps this item, which is among those that the file has not written
 
     def flush(self) -> None:
         """Write all added messages to the files."""
@@ -246,6 +246,7 @@ class Writing:
             self._make_room(disk, due, now_s)
         if due.every("finish", _LISTED_S):
             self._finisher.retry()
+        # ``disk`` is as before the deletions: whether there is room again shows at the next look.
         if disk.free_bytes < options.free_bytes // 2 or not disk.has_inodes:
             self.flush()
             self.rotate(all_of_them=True)  # while there is room to finish them

@@ -70,7 +70,7 @@ class Surfaces:
             yaw = pose.heading + quarter * math.pi / 2
             x, y = pose.x + half * math.cos(yaw), pose.y + half * math.sin(yaw)
             shade = (round(colour[0] * light), round(colour[1] * light), round(colour[2] * light))
-            surfaces.append(Surface(*_edges(x, y, half, yaw), 0.0, top, 0, shade))
+            surfaces.append(Surface(*_edges(x, y, half, yaw), 0.0, top, layer=0, colour=shade))
             if place.tag is not None:
                 size = min(place.radius_m * _TAG_SIDE, 0.75 * top)
                 surfaces.append(self._tag(place.tag, size, x, y, top / 2, yaw))
@@ -80,7 +80,7 @@ class Surfaces:
         if number not in self._textures:
             self._textures[number] = _tag_textures(self._world.family, number)
         half = size / 2 * self._modules_across / (self._modules_across - 2)  # ``size`` is without the white border
-        return Surface(*_edges(x, y, half, yaw), z - half, z + half, 2, textures=self._textures[number])
+        return Surface(*_edges(x, y, half, yaw), z - half, z + half, layer=2, textures=self._textures[number])
 
 
 def _edges(x: float, y: float, half: float, yaw: float) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -91,7 +91,7 @@ def _edges(x: float, y: float, half: float, yaw: float) -> tuple[tuple[float, fl
 
 def _left_side(wall: Wall, index: int) -> Surface:
     colour = _bgr(wall.colour) if wall.colour else _WALL_COLOURS[index % len(_WALL_COLOURS)]
-    return Surface((wall.x2, wall.y2), (wall.x1, wall.y1), 0.0, wall.height_m, 0, colour)
+    return Surface((wall.x2, wall.y2), (wall.x1, wall.y1), 0.0, wall.height_m, layer=0, colour=colour)
 
 
 def _both_sides(wall: Wall, index: int) -> tuple[Surface, Surface]:
@@ -116,7 +116,8 @@ def _drawn(drawing: Drawing) -> Surface:
         cv2.fillPoly(mask, points, 255)
     edges = _edges(drawing.x, drawing.y, drawing.width_m / 2, math.radians(drawing.yaw_deg))
     low, high = drawing.z - drawing.height_m / 2, drawing.z + drawing.height_m / 2
-    return Surface(*edges, low, high, 1, textures=_halved(picture, _SMALLEST_PX), masks=_halved(mask, _SMALLEST_PX))
+    textures, masks = _halved(picture, _SMALLEST_PX), _halved(mask, _SMALLEST_PX)
+    return Surface(*edges, low, high, layer=1, textures=textures, masks=masks)
 
 
 def _modules(world: World) -> int:
