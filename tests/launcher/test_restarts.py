@@ -27,7 +27,7 @@ from pebble.launcher.run_lock import RunLock
 from pebble.launcher.sd_notify import SystemdNotifier
 from pebble.runtime import notes
 from pebble.runtime.notes import Held, Wanted
-from tests.launcher.robot import CONNECTION, DEVICE, Launch, Robot, Row
+from tests.launcher.conftest import CONNECTION, DEVICE, Launch, Robot, Row
 from tests.support import gone, refused, until
 
 
