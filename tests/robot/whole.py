@@ -24,10 +24,9 @@ from pebble.extensions.operator.client.estop import StopSender, new_name
 from pebble.transports import Message
 from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps
 from tests.kit.stalls import Stalls, lost_s
-from tests.robot.alive import Alive
 from tests.robot.operator import Operator, ReceivedMessage
 from tests.robot.rig import BASE, Rig, descendants, restore, saved_by
-from tests.robot.whole_rules import History, Seen, by_script
+from tests.robot.whole_rules import Alive, History, Seen, by_script
 from tests.support import Broker, until
 
 STATE, STOPPED = "outgoing/control/serial", "outgoing/estop/serial"

@@ -30,10 +30,9 @@ from pebble.config import Config, load
 from pebble.contract import CONTROL_STATE, CONTROL_TURN, CONTROL_VOUCHED, ESTOP_STATE, codec
 from pebble.runtime.process import view_of
 from pebble.transports import Message, QoS
-from tests.kit.schedules import RandomSteps
+from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps, perform_steps
 from tests.robot.lockstep.bridge import Bridge, Outside
-from tests.robot.lockstep.drivers import BASE, SCRIPT, STRANGER, Commands, Driver
-from tests.robot.lockstep.holders import Holders
+from tests.robot.lockstep.drivers import BASE, SCRIPT, STRANGER, Commands, Driver, Holders
 from tests.robot.lockstep.network import Network, Process, Scheduler
 from tests.robot.lockstep.owner import Disk, Owner, Wheels
 from tests.robot.lockstep.stop_rules import StopRules
@@ -428,3 +427,19 @@ def configs(*, groups: bool = False) -> Iterator[tuple[Config, ...]]:
         yield tuple(
             configuration(Path(folder), strangers, bridged=bridged, groups=groups) for strangers, bridged in kinds
         )
+
+
+def _perform(configs: tuple[Config, ...], schedule: Steps) -> Outcome:
+    layout, steps = schedule
+    world = TwoOwners(layout, configs)
+    perform_steps(world, steps)
+    world.rest()
+    return Outcome()
+
+
+ENGINE = Engine(
+    draw=STEPS,
+    world=lambda kind: configs(groups=kind == "groups"),  # what schedules share
+    perform=_perform,
+    kinds=("owners", "groups"),
+)
