@@ -6,9 +6,8 @@ runs as long as a module's tests of one kind; `close_clients` ends what one test
 
 from __future__ import annotations
 
-import base64
 import json
-import pickle
+import sys
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
@@ -106,11 +105,10 @@ class Net(ABC):
 
 
 class ProcessPeer:
-    """Runs tests/transports/peer.py and talks to it in lines of JSON."""
+    """A client in a process of its own (:func:`main`), asked in lines of JSON."""
 
     def __init__(self, kind: str, name: str, settings: Any, will: Message | None) -> None:
-        recipe = base64.b64encode(pickle.dumps((kind, name, settings, will))).decode()
-        self._process = Forked("tests.transports.peer", recipe)
+        self._process = Forked("tests.transports.net", kind, name, settings, will)
         assert self._answer() is True, "the peer did not connect"
         self.pid = self._process.pid
 
@@ -148,6 +146,31 @@ class ProcessPeer:
     def _release(self) -> None:
         for pipe in (self._process.stdin, self._process.stdout):
             pipe.close()
+
+
+def main(kind: str, name: str, settings: Any, will: Message | None) -> None:
+    """Follow the commands in lines of JSON on stdin."""
+    client, received = create(kind, name, settings, will=will).open(10), list[Message]()
+    _report(client.state is State.CONNECTED)
+    for line in sys.stdin:
+        request = json.loads(line)
+        if "close" in request:
+            client.close()
+            _report(True)
+            return
+        if "listen" in request:
+            client.subscribe("#", received.append)
+            _report(True)
+        elif "heard" in request:
+            _report([len(received), received[-1].payload.decode() if received else ""])
+        else:
+            payload = bytes.fromhex(request["payload"])
+            _report(client.publish(request["topic"], payload, qos=QoS(request["qos"]), retain=request["retain"]))
+
+
+def _report(answer: object) -> None:
+    sys.stdout.write(json.dumps(answer) + "\n")
+    sys.stdout.flush()
 
 
 class Received:
