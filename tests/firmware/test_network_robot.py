@@ -34,19 +34,10 @@ EPOCH_MS = 1_800_000_000_000  # of the virtual time server at virtual time 0
 AHEAD = {"minilamp": (1.0, 1.0, 0.0), "benjr": (-0.5, -0.5)}
 
 
-def online(
-    kind: str,
-    seed: int = 1,
-    *,
-    refused: Iterable[str] = (),
-    **settings: Any,
-) -> Drill:
-    """A robot that is connected; ``refused`` topics cannot be subscribed to, ``settings`` change those of its board."""
+def online(kind: str, seed: int = 1, *, refused: Iterable[str] = ()) -> Drill:
+    """A robot that is connected; ``refused`` topics cannot be subscribed to."""
     drill = Drill(kind, seed)
     drill.broker.refused = set(refused)
-    if settings:
-        base = {"robot": {"id": "rover"}, "wifi": {"ssid": "home"}, "mqtt": {"host": "10.0.0.2"}}
-        drill.robot = drill.board.load(kind, {**base, **settings})
     while drill.robot.session.connection.state != "online":
         drill.turn(0.01)
         assert drill.seconds < 30, drill.robot.session.connection.reason
@@ -79,11 +70,6 @@ def published(drill: Drill, metric: str) -> list[Any]:
     return [json.loads(payload) for payload in drill.received(f"{BASE}/outgoing/{metric}")]
 
 
-def test_groups_whose_topic_is_refused_are_not_announced() -> None:
-    (capabilities,) = published(online("minilamp", refused={f"{BASE}/incoming/group"}), "capabilities")
-    assert "groups" not in capabilities["value"]
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_its_capabilities_are_a_retained_message(kind: str) -> None:
     drill = online(kind)
@@ -114,7 +100,7 @@ def test_its_client_id_is_its_own_and_as_long_as_any_broker_takes(monkeypatch: p
 
     monkeypatch.setattr(VirtualBroker, "taken_over", taken_over)
     drill = online("benjr")
-    drill.drop_robot()
+    drill.broker.drop_all()
     drill.wait(10)
     online("benjr", seed=2)
     assert len(ids) == 3
@@ -219,7 +205,7 @@ def test_every_address_of_its_broker_has_a_turn_and_the_one_that_worked_comes_ag
     assert drill.robot.session.connection.state == "online"
     losses = drill.robot.session.connection.losses
     assert losses <= 3
-    drill.drop_robot()
+    drill.broker.drop_all()
     drill.wait(5)
     assert (drill.robot.session.connection.state, drill.robot.session.connection.losses) == ("online", losses + 1)
 
@@ -389,7 +375,7 @@ class Hall:
         self.link = stack.enter_context(TcpProxy(self.broker.port))
         self.operator = stack.enter_context(closing(Operator(self.broker.port, "pebble/robots", "+/outgoing/online")))
         self.send(b'{"x": 0, "z": 1}', retain=True)
-        self.robots = stack.enter_context(Robots("127.0.0.1", self.link.port))
+        self.robots = stack.enter_context(Robots(self.link.port))
         self.robots.wait_online()
         assert self.beating(time.monotonic())
         self.have_not_moved()

@@ -25,7 +25,7 @@ from pebble.services.av_daemon.service import Reports
 from pebble.services.av_daemon.source import Capture, Source
 from pebble.services.av_daemon.stream import Stream
 from pebble.transports import QoS
-from tests.ext.av.av_daemon.av_rig import Remembering, is_speech, options
+from tests.ext.av.media_rig import Remembering, is_speech, options
 from tests.fakes.installed import Installed
 from tests.kit.robot import ProgramRobot
 from tests.kit.scene import read_counter
