@@ -34,10 +34,13 @@ EPOCH_MS = 1_800_000_000_000  # of the virtual time server at virtual time 0
 AHEAD = {"minilamp": (1.0, 1.0, 0.0), "benjr": (-0.5, -0.5)}
 
 
-def online(kind: str, seed: int = 1, *, refused: Iterable[str] = ()) -> Drill:
-    """A robot that is connected; ``refused`` topics cannot be subscribed to."""
+def online(kind: str, seed: int = 1, *, refused: Iterable[str] = (), security: Any = None) -> Drill:
+    """A robot that is connected; ``refused`` topics cannot be subscribed to, ``security`` is that of its settings."""
     drill = Drill(kind, seed)
     drill.broker.refused = set(refused)
+    if security is not None:
+        base = {"robot": {"id": "rover"}, "wifi": {"ssid": "home"}, "mqtt": {"host": "10.0.0.2"}}
+        drill.robot = drill.board.load(kind, {**base, "security": security})
     while drill.robot.session.connection.state != "online":
         drill.turn(0.01)
         assert drill.seconds < 30, drill.robot.session.connection.reason
