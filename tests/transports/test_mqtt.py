@@ -113,21 +113,6 @@ def reconnected(client: Transport, times: int = 2) -> bool:
 
 
 @both_protocols
-def test_as_published_shows_what_was_published_with_retain(
-    broker: Broker, clients: Clients, topic: str, protocol: str
-) -> None:
-    bridge = clients(broker.port, "bridge", as_published=True, protocol=protocol)
-    other, received = clients(broker.port), Received()
-    assert bridge.as_published
-    assert bridge.exact_echo
-    bridge.subscribe(topic, received, echo=False)
-    other.publish(topic, b"fleeting", qos=DELIVERED)
-    other.publish(topic, b"kept", qos=DELIVERED, retain=True)
-    assert received.until(b"fleeting", b"kept")
-    assert [(one.retain, one.retain_requested) for one in received.messages] == [(False, False), (True, True)]
-
-
-@both_protocols
 def test_subscribe_returns_after_the_retained_messages_however_long_after_the_suback(
     broker: Broker, clients: Clients, protocol: str
 ) -> None:
