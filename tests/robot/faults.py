@@ -15,7 +15,7 @@ from functools import partial
 from pebble.config import LAUNCHER_LOCK
 from tests.robot.operator import Driver, Operator, number_of
 from tests.robot.rig import STOP, Rig
-from tests.support import until
+from tests.support import gone, until
 
 AGE_S = 2.5  # no older command ever reaches the wheels
 BACK_S = 5.0  # after the fault's end commands reach the wheels again
@@ -109,7 +109,7 @@ def _launcher_killed(rig: Rig) -> Iterator[None]:
     """Kill the launcher, and start it again, as systemd does."""
     killed, children = time.monotonic(), rig.kill_launcher()
     yield
-    assert until(lambda: not any(map(rig.alive, children)), 1.0), "children outlived their launcher by 1 s"
+    assert until(lambda: all(map(gone, children)), 1.0), "children outlived their launcher by 1 s"
     stopped_at, wheels = rig.mcu.drives(killed)[-1]
     assert wheels == STOP
     assert stopped_at - killed <= 1.0

@@ -13,7 +13,7 @@ from tests.commands.command_line import program
 from tests.robot.conftest import Station
 from tests.robot.operator import Operator, driving, retained_messages
 from tests.robot.rig import BASE, STOP, Rig
-from tests.support import further, until
+from tests.support import further, gone, until
 
 pytestmark = pytest.mark.alone  # deadlines are checked
 
@@ -223,5 +223,5 @@ def test_stopping_the_robot_stops_the_wheels_and_reports_offline(uplinked: Stati
     assert rig.stop() == 0
     assert rig.mcu.drives(began)[-1][1] == STOP
     assert until(lambda: (last := uplinked.operator.last("outgoing/online")) and last.json.get("online") is False, 3)
-    assert not [pid for pid in left_behind.values() if rig.alive(pid)]
+    assert all(map(gone, left_behind.values()))
     rig.start()

@@ -31,10 +31,9 @@ from pebble.contract import CONTROL_STATE, CONTROL_TURN, CONTROL_VOUCHED, ESTOP_
 from pebble.runtime.process import view_of
 from pebble.transports import Message, QoS
 from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps, perform_steps
-from tests.robot.lockstep.bridge import Bridge, Outside
 from tests.robot.lockstep.drivers import BASE, SCRIPT, STRANGER, Commands, Driver, Holders
 from tests.robot.lockstep.network import Network, Process, Scheduler
-from tests.robot.lockstep.owner import Disk, Owner, Wheels
+from tests.robot.lockstep.owner import Bridge, Disk, Outside, Owner, Wheels
 from tests.robot.lockstep.stop_rules import StopRules
 
 FIRST, SECOND = "arm", "serial"  # in the config the second comes first
