@@ -155,7 +155,7 @@ def test_who_comes_in_by_that_door_finds_no_watchdog(monkeypatch: pytest.MonkeyP
 
 
 #: Of a golden file, a transcript: milliseconds since the firmware was loaded, a sign, and what happened.
-#: ``=`` volts at a pin, or high or low; ``>`` a line from the host; ``<`` a line from the board; ``!`` what the motors do
+#: ``=`` volts at a pin, or high or low; ``>`` a line from the host; ``<`` a line from the board; ``!`` what motors do
 #: from then on, left and right, + = forward; ``.`` the end. A report that says the same as the one before is left out.
 #: What the world did is played again, and all of it must come out as it stands there, byte for byte.
 Entry = tuple[int, str, str]

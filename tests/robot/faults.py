@@ -43,7 +43,9 @@ class Drive:
 
     def end(self, over: float) -> None:
         """Wait until commands sent after the fault get through; then let go."""
-        assert until(lambda: self._arrived_after(over), BACK_S), "no driving within 5 s of the fault's end"
+        assert until(lambda: any(self.driver.sent_at[number] >= over for _, number in self._commands(over)), BACK_S), (
+            "no driving within 5 s of the fault's end"
+        )
         self.back_s = time.monotonic() - over
         self.finish()
 
@@ -81,9 +83,6 @@ class Drive:
 
     def _commands(self, since: float) -> list[tuple[float, int]]:
         return [(at, number_of(*wheels)) for at, wheels in self.rig.mcu.drives(since) if wheels != STOP]
-
-    def _arrived_after(self, since: float) -> bool:
-        return any(self.driver.sent_at[number] >= since for _, number in self._commands(since))
 
 
 def _at(event: tuple[float, bool | None]) -> float:
@@ -178,10 +177,6 @@ def frozen(*pids: int) -> Iterator[None]:
             yield
 
 
-def _robot_frozen(rig: Rig) -> AbstractContextManager[None]:
-    return frozen(*rig.processes().values(), rig.launcher_pid)
-
-
 @dataclass(frozen=True)
 class Fault:
     """A fault that lasts for some seconds. ``turns_s``: how long wheels may turn without another line."""
@@ -217,5 +212,7 @@ FAULTS = {
     "the serial bridge stands still": Fault(
         lambda rig: frozen(rig.processes()[_OWNER]), 2.8, turns_s=_MCU_TURNS_S
     ),
-    "the whole robot stands still": Fault(_robot_frozen, 2.8, turns_s=_MCU_TURNS_S),
+    "the whole robot stands still": Fault(
+        lambda rig: frozen(*rig.processes().values(), rig.launcher_pid), 2.8, turns_s=_MCU_TURNS_S
+    ),
 }  # fmt: skip
