@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -40,33 +39,28 @@ def retain_messages(port: int, messages: dict[str, Any]) -> None:
     publisher.close()
 
 
-@pytest.fixture(params=["mqtt", "zenoh", further("single"), further("mirror")])
-def unstarted(request: pytest.FixtureRequest) -> Iterator[Rig]:
-    kind, mirror = ("zenoh", True) if request.param == "mirror" else (request.param, False)
-    with Rig(kind, mirror=mirror, start=False) as rig:
-        yield rig
-
-
-def test_what_is_retained_does_nothing_and_a_live_stop_that_asks_to_be_retained_stops(unstarted: Rig) -> None:
+@pytest.mark.parametrize("kind", ["mqtt", "zenoh", further("single"), further("mirror")])
+def test_what_is_retained_does_nothing_and_a_live_stop_that_asks_to_be_retained_stops(kind: str) -> None:
     """Neither at the start, nor when the uplink comes back. Afterwards the broker has the live stop, now old."""
-    rig, state = unstarted, "outgoing/estop/serial"
-    retain_messages(rig.remote.port, COMMANDS | OLD_STOP)
-    if rig.local is not None:
-        retain_messages(rig.local.port, OLD_STOP)
-    rig.start()
-    for _ in range(2):
-        assert not rig.operator.wait_for(state).json["latched"]
-        assert_untouched(rig)
-        rig.uplink.drop()
-        rig.operator.wait_for("outgoing/online", since=time.monotonic() + 0.3)
-    if rig.local is not None:
-        assert not set(retained_messages(rig.local.port, BASE)) & set(COMMANDS)
-    began = time.monotonic()
-    assert until(lambda: _turns(rig, began), 5)
-    assert not any(seen.json["latched"] or seen.json["count"] for seen in rig.operator.on(state))
-    assert until(lambda: _is_stopped(rig, state), 5, step=0.2)
-    stopped = time.monotonic()
-    assert not until(lambda: _turns(rig, stopped), 1)
+    state = "outgoing/estop/serial"
+    with Rig(kind.replace("mirror", "zenoh"), mirror=kind == "mirror", start=False) as rig:
+        retain_messages(rig.remote.port, COMMANDS | OLD_STOP)
+        if rig.local is not None:
+            retain_messages(rig.local.port, OLD_STOP)
+        rig.start()
+        for _ in range(2):
+            assert not rig.operator.wait_for(state).json["latched"]
+            assert_untouched(rig)
+            rig.uplink.drop()
+            rig.operator.wait_for("outgoing/online", since=time.monotonic() + 0.3)
+        if rig.local is not None:
+            assert not set(retained_messages(rig.local.port, BASE)) & set(COMMANDS)
+        began = time.monotonic()
+        assert until(lambda: _turns(rig, began), 5)
+        assert not any(seen.json["latched"] or seen.json["count"] for seen in rig.operator.on(state))
+        assert until(lambda: _is_stopped(rig, state), 5, step=0.2)
+        stopped = time.monotonic()
+        assert not until(lambda: _turns(rig, stopped), 1)
 
 
 def assert_untouched(rig: Rig) -> None:

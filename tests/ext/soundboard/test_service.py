@@ -151,11 +151,6 @@ def make(local: Broker) -> Iterator[Make]:
         yield made
 
 
-@pytest.fixture(params=["mqtt", "zenoh"])
-def both(request: pytest.FixtureRequest, make: Make) -> Soundboard:
-    return make(request.param)
-
-
 @pytest.fixture
 def board(make: Make) -> Soundboard:
     return make()
@@ -164,7 +159,9 @@ def board(make: Make) -> Soundboard:
 PLAY, STOP = ["play", "start", "on", "enable", "enabled"], ["stop", "off", "disable", "disabled"]
 
 
-def test_a_clip_is_listed_played_as_it_is_and_over(both: Soundboard) -> None:
+@pytest.mark.parametrize("kind", ["mqtt", "zenoh"])
+def test_a_clip_is_listed_played_as_it_is_and_over(make: Make, kind: str) -> None:
+    both = make(kind)
     path = write_wav(both.sounds / "intro.wav", tone(0.4, 2))
     write_wav(both.sounds / "warn" / "ba\u0308r.WAV", tone(0.1))
     (both.sounds / "notes.txt").write_text("no sound")

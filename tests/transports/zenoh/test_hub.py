@@ -73,18 +73,11 @@ def test_a_client_is_asked_for_what_is_missing_or_its_own_and_changed(
     assert made.lacks(Hello("me", 5, None, own)) == lacking
 
 
-@pytest.fixture
-def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Room for 100 bytes."""
-    monkeypatch.setattr(hub_store, "MAX_BYTES", 100)
-    monkeypatch.setattr(hub_store, "OVERHEAD", 0)
-    monkeypatch.setattr(hub_store, "MAX_WILLS", 1)
-
-
-@pytest.mark.usefixtures("small")
 def test_what_has_no_room_is_refused_and_leaves_the_others_and_its_own_older_value(
-    caplog: pytest.LogCaptureFixture,
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    for limit, value in (("MAX_BYTES", 100), ("OVERHEAD", 0), ("MAX_WILLS", 1)):
+        monkeypatch.setattr(hub_store, limit, value)
     made = store(retained("a", bytes(90)), retained("b", bytes(20)), retained("a", bytes(95)))
     assert [len(record.payload) for record in made.retained()] == [95]
     assert not made.apply(retained("a", bytes(100)))
