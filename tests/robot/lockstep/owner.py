@@ -1,4 +1,7 @@
-"""The motor owner: the real service, with a recorded serial line, files in memory, and a deadline behind it."""
+"""The motor owner: the real service, with a recorded serial line, files in memory, and a deadline behind it.
+
+And the bridge: the real service, and operators' messages that wait for it at their broker.
+"""
 
 from __future__ import annotations
 
