@@ -20,8 +20,8 @@ from pebble.extensions.media.speech import PERIOD_S, Speech
 from pebble.services.audio_publisher import service
 from pebble.services.audio_publisher.rate_control import LevelControl, Step, steps
 from pebble.services.audio_publisher.service import AudioPublisher
-from pebble.transports import Message, State, Transport
-from pebble.transports.base import Outgoing, Subscription
+from pebble.transports import Message, Transport
+from pebble.transports.base import Outgoing
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.ext.av.media_rig import Device, MediaProgram, Operator
 from tests.kit.sound import best_match, envelope
@@ -32,11 +32,11 @@ CHUNK = bytes(640)  # 20 ms at 16 kHz
 SOUND = FrameInfo(format="s16le", rate=16_000, channels=1, captured_ms=1)
 
 
-class Stuck(Transport):
+class Stuck(MemoryTransport):
     """Accepts everything, and confirms all but the newest packets, ``behind`` of them."""
 
     def __init__(self, behind: int) -> None:
-        super().__init__("stuck")
+        super().__init__("stuck", MemoryHub())
         self.behind = behind
         self.packets: list[bytes] = []
 
@@ -45,18 +45,9 @@ class Stuck(Transport):
         unconfirmed = self.packets[max(0, len(self.packets) - self.behind) :]
         return Outgoing(waiting=sum(len(packet) + 60 for packet in unconfirmed))
 
-    def _open(self, timeout: float) -> None:
-        self._set_state(State.CONNECTED)
-
-    def _close(self, will: Message | None) -> None: ...
-
     def _send(self, message: Message, urgent: bool) -> bool:
         self.packets.append(message.payload)
         return True
-
-    def _declare(self, subscription: Subscription) -> None: ...
-
-    def _undeclare(self, subscription: Subscription) -> None: ...
 
 
 Make = Callable[..., AudioPublisher]
