@@ -345,8 +345,6 @@ def test_a_fleet_takes_turns_of_kinds_shows_its_status_and_ends_in_order(start: 
 @pytest.mark.parametrize(
     ("options", "named"),
     [
-        (("fleet", "http://x"), "--broker must be mqtt://"),
-        (("minilamp", "mqtt://ann:secret@x"), "holds a password"),
         (("benjr", "nowhere.json"), "nowhere.json"),
         (("fleet", "mqtt://127.0.0.1", "-n", "1001"), "1000"),
         (("minilamp", "mqtt://127.0.0.1", "a/b"), "robot.id"),
@@ -358,7 +356,6 @@ def test_what_makes_no_sense_is_one_line(options: tuple[str, ...], named: str) -
     with pytest.raises(PebbleError) as error:
         app.run(["sim", kind, "--broker", broker, *more])
     assert named in str(error.value)
-    assert "secret" not in str(error.value)
     assert len(str(error.value).splitlines()) == 1
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterable
-from functools import partial
 from types import TracebackType
 from typing import Self
 
@@ -26,7 +25,8 @@ class Robots:
         self.moves: dict[str, list[tuple[float, tuple[float, float]]]] = {kind: [] for kind in kinds}
         self.robots: dict[str, WirelessRobot] = {}
         for kind, moves in self.moves.items():
-            identity, moved = Identity("pebble", "robots", kind), partial(_note, moves)
+            identity = Identity("pebble", "robots", kind)
+            moved = lambda at, motors, moves=moves: moves.append((at, motors))  # noqa: E731
             self.robots[kind] = self.fleet.add(kind, identity, moving_s=0.01, on_motors=moved, security=Security())
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -59,7 +59,3 @@ class Robots:
 
     def _run(self) -> None:
         self.fleet.run(lambda: not self._ending.is_set())
-
-
-def _note(moves: list[tuple[float, tuple[float, float]]], at: float, motors: tuple[float, float]) -> None:
-    moves.append((at, motors))

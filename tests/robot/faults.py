@@ -222,16 +222,13 @@ FAULTS = {
 }  # fmt: skip
 
 
-# -- floods that a stranger at the broker may send
-
-
 _SLICE_S = 0.02
 _CONNACK_BYTES = 4
 
 
 @dataclass(frozen=True)
 class Flood:
-    """Messages to the robot: ``{n}`` in the topic counts to ``topics`` and begins anew."""
+    """Messages of a stranger to the robot: ``{n}`` in the topic counts to ``topics`` and begins anew."""
 
     topic: str
     payload: bytes

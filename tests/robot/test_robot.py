@@ -129,9 +129,6 @@ def test_a_stop_from_either_side_holds_over_restarts_until_its_reset(kind: str) 
         assert pebble("estop", "status", remote) == (0, f"{BASE.rpartition('/')[2]}: free\n")
 
 
-# -- robots that serve several tests
-
-
 def stop_and_wait(station: Station) -> None:
     """Send a stop until it reaches the wheels: a serial line and a mirror open late."""
     began = time.monotonic()

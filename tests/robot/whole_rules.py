@@ -174,9 +174,6 @@ def _may_end(reset: Event, name: str, latched: EstopState, boots: list[str]) -> 
     return shown.boot in boots and boots.index(shown.boot) > boots.index(latched.boot)
 
 
-# -- which scripts are alive
-
-
 _PERIOD_S = 0.01
 _YOUNG_S = 1.0  # the environment of a process is its own only after exec
 

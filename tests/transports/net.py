@@ -194,9 +194,6 @@ class Received:
         return until(lambda: self.payloads == list(payloads), timeout)
 
 
-# -- the kinds without a process of their own, and mosquitto
-
-
 class MemoryNet(Net):
     kind = "memory"
 

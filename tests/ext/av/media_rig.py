@@ -48,11 +48,8 @@ class MediaProgram(ProgramRobot):
         self.name, self._request, self.run_dir = name, request, self.config.run_dir()
 
     def __enter__(self) -> Self:
-        self.start()
-        return self
-
-    def start(self) -> None:
         self.process = self.run(f"pebble.services.{self.name}.service:{self.name.title().replace('_', '')}")
+        return self
 
     def ask(self, **request: Any) -> None:
         """What the bridge passes on from operators."""

@@ -18,7 +18,7 @@ from msgspec.structs import replace
 
 from pebble.errors import TransportError
 from pebble.extensions.media.frames import FrameReader, FrameWriter
-from pebble.transports import Message, QoS, ZenohSettings, create
+from pebble.transports import QoS, ZenohSettings, create
 from pebble.transports.peers import PeerRegistry, prepare_run_dir
 from pebble.transports.zenoh import callbacks, wire
 from pebble.transports.zenoh.callbacks import direct
@@ -398,12 +398,6 @@ def answering(hub: HubProcess) -> Iterator[None]:
         process.stdin.close()
 
 
-def size_to(received: list[int]) -> Callable[[Message], None]:
-    """A handler that keeps no message: thousands of them would make Python's collector look at all that pytest has,
-    which on a busy machine takes the 0.3 s after which a sender gives up (measured)."""
-    return lambda message: received.append(len(message.payload))
-
-
 @pytest.fixture
 def hub(tmp_path: Path) -> Iterator[HubProcess]:
     hub = HubProcess(tmp_path).start()
@@ -416,7 +410,9 @@ def test_a_handler_may_wait_for_what_is_published(hub: HubProcess, requests: lis
     """Its thread may be the one that waits for the sockets: the guard has another one do that."""
     received: list[int] = []
     with create("zenoh", "asking", hub.settings) as transport, answering(hub):
-        transport.subscribe("answer", size_to(received), direct=True)
+        # It keeps no message: thousands of them would make Python's collector look at all that pytest has, which on a
+        # busy machine takes the 0.3 s after which a sender gives up (measured).
+        transport.subscribe("answer", lambda message: received.append(len(message.payload)), direct=True)
         for number in range(1, 4):
             for request in requests:
                 assert transport.publish("request", request, qos=QoS.DELIVERED)
