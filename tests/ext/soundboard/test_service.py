@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import sys
-import wave
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -41,12 +40,7 @@ def tone(seconds: float, channels: int = 1, rate: int = RATE) -> Samples:
 
 def write_wav(path: Path, samples: Samples, rate: int = RATE) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    with wave.open(str(path), "wb") as file:
-        file.setnchannels(samples.shape[1])
-        file.setsampwidth(2)
-        file.setframerate(rate)
-        file.writeframes(samples.astype("<i2").tobytes())
-    return path
+    return encode(path, samples, rate)
 
 
 class Soundboard(ProgramRobot):
