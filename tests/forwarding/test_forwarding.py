@@ -311,9 +311,8 @@ class TestEventBuffer:
         self.counters = Counters()
         return EventBuffer(remote, self.counters, clock=clock)
 
-    def publish(self, events: EventBuffer, *numbers: int) -> None:
-        for number in numbers:
-            events.send(Message("t", b"%d" % number, QoS.DELIVERED))
+    def publish(self, events: EventBuffer, number: int) -> None:
+        events.send(Message("t", b"%d" % number, QoS.DELIVERED))
 
     def test_repeats_what_a_dying_link_may_have_swallowed(
         self, events: EventBuffer, remote: Wire, clock: Clock

@@ -91,9 +91,6 @@ def _turns(rig: Rig, since: float) -> bool:
     return any(wheels != (0.0, 0.0) for _, wheels in rig.mcu.drives(since))
 
 
-# -- pebble estop: from the brokers of the operators and from its own transport
-
-
 def pebble(*arguments: object) -> tuple[int, str]:
     process = program(*map(str, arguments))
     out, err = process.communicate(timeout=90)

@@ -151,9 +151,6 @@ def test_a_file_that_others_can_read_is_logged(tmp_path: Path, monkeypatch: pyte
     assert "state: others can read it, which cannot be changed here: Operation not permitted" in caplog.text
 
 
-# -- what the hub takes as a will: nothing that happens once, from whomever
-
-
 REFUSED = (
     *(f"{BASE}/incoming/{metric}" for metric in ("drive-values", "estop", "mcu/arm-1/move", "flags/reboot")),
     *(f"{BASE}/incoming/{metric}" for metric in ("by/otto/drive-values", "drive-values/", "/drive-values", "%2A")),

@@ -264,10 +264,6 @@ def test_nothing_below_1_2() -> None:
         assert agreed(version) == version.name.replace("_", ".")
 
 
-def _number(file: Path) -> int:
-    return int(file.read_text())
-
-
 def _replaced(file: Path, text: str) -> None:
     fresh = file.with_name("fresh")
     fresh.write_text(text)
@@ -299,7 +295,7 @@ def test_a_change_is_taken_up_and_what_cannot_be_used_is_not(
     file = tmp_path / "certs" / "number"
     file.parent.mkdir()
     file.write_text("1")
-    value = Renewed([file], lambda: _number(file))
+    value = Renewed([file], lambda: int(file.read_text()))
     change(file)
     assert [value.get() for _ in range(3)] == [expected] * 3
     assert len([record for record in caplog.records if record.levelname == "WARNING"]) <= 1
