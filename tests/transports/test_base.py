@@ -222,12 +222,8 @@ def test_a_third_party_registers_through_an_entry_point(monkeypatch: pytest.Monk
     assert {"memory", "mqtt", "theirs", "zenoh"} <= set(str(refused.value).partition("known are ")[2].split(", "))
 
 
-def not_a_transport(client_id: str, settings: object, *, will: object) -> str:
-    return client_id
-
-
 def test_what_is_not_a_transport_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    install(monkeypatch, "tests.transports.test_base:not_a_transport")
+    install(monkeypatch, "unittest.mock:Mock")
     with pytest.raises(TransportError, match="is not a pebble"):
         create("theirs", "client", None)
 
