@@ -72,7 +72,7 @@ _LONG = (
         "transports/test_mqtt.py",
         "ext/recordings/recorder",
     ),
-    *("ext/page/test_types.py", "firmware/test_deadman_virtual.py", "motion/test_traces.py"),
+    *("ext/page/test_types.py", "firmware/test_deadman_virtual.py", "motion/test_motion.py"),
 )
 
 

@@ -164,13 +164,9 @@ def granted(tmp_path: Path, *cases: tuple[str, str, dict[str, str]]) -> list[boo
     return list(json.loads(done.stdout))
 
 
-def action_commands() -> list[list[str]]:
-    """The commands of the three actions, as the unit's comment gives them."""
-    return [json.loads(line) for line in re.findall(r'^# +(\["systemctl".*\])$', ROBOT.read_text(), re.MULTILINE)]
-
-
 def test_polkit_allows_the_commands_that_the_unit_recommends_and_only_the_robot(tmp_path: Path) -> None:
-    reboot, restart, update = action_commands()
+    lines = re.findall(r'^# +(\["systemctl".*\])$', ROBOT.read_text(), re.MULTILINE)  # as the unit's comment gives them
+    reboot, restart, update = map(json.loads, lines)
     assert reboot == ["systemctl", "--no-ask-password", "reboot"]
     jobs = [{"verb": command[-2], "unit": command[-1]} for command in (restart, update)]
     asked = [(REBOOT, {}), (f"{REBOOT}-multiple-sessions", {}), *((RESTART, job) for job in jobs)]

@@ -140,9 +140,6 @@ def test_a_payload_without_a_value_is_refused(channel: Channel, raw: bytes) -> N
     assert channel.metric in refused(channel, raw)
 
 
-# -- boolean controls
-
-
 # -- drive values
 
 

@@ -21,6 +21,7 @@ from pebble.extensions.lab.simulation.micropython.clock import VirtualClock
 from pebble.extensions.lab.simulation.micropython.ports import OF_ROBOT
 from tests.ext.lab.simulation.virtual_broker import VirtualBroker
 from tests.ext.lab.simulation.virtual_network import VirtualNetwork
+from tests.kit.schedules import ViolatedError
 
 START_S: Final = 1000.0  # of the clock, when a drill begins
 BUSY_S: Final = 0.01
@@ -37,10 +38,6 @@ CONTROL, HOLDER = f"{BASE}/incoming/control", f"{BASE}/outgoing/control/mcu"
 
 _WRAP_MS = 1 << 30
 Outputs = tuple[float, ...]
-
-
-class ViolatedError(AssertionError):
-    """The rule was broken."""
 
 
 class WatchedClock(VirtualClock):
@@ -241,10 +238,6 @@ class Drill:
         return state
 
     # -- faults
-
-    def drop_robot(self) -> None:
-        """The broker throws it out."""
-        self.broker.drop_all()
 
     def clear_sky(self) -> None:
         """All faults are over."""

@@ -283,7 +283,7 @@ def test_control_ends_without_its_holder_and_outlives_a_connection() -> None:
     drill = online("minilamp")
     drill.request(for_ms=10_000)
     drill.wait(0.5)
-    drill.drop_robot()
+    drill.broker.drop_all()
     states = len(drill.received(HOLDER))
     drill.wait(6.0)
     assert len(drill.received(HOLDER)) > states
@@ -337,7 +337,7 @@ def test_of_what_has_no_name_or_is_retained_only_stops_and_zeros_count() -> None
     assert (drill.control()["by"], drill.control()["id"]) == ("otto", "bbbbbbbb")
     send(drill, "by/page-1/control/take", id="aaaaaaaa", by="ann")
     drill.wait(0.5)
-    drill.drop_robot()
+    drill.broker.drop_all()
     drill.wait(5.0)
     assert drill.control()["by"] in ("page-1/ann", "")
     assert drill.control()["key"] != key

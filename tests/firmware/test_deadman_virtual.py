@@ -21,7 +21,8 @@ import pytest
 from pebble.extensions.lab.simulation.micropython.faults import failure
 from pebble.extensions.lab.simulation.wireless import KINDS
 from tests.ext.lab.simulation.virtual_network import Answers
-from tests.firmware.drill import LIMIT_S, ONLINE, RESENT_S, START_S, Drill, ViolatedError
+from tests.firmware.drill import LIMIT_S, ONLINE, RESENT_S, START_S, Drill
+from tests.kit.schedules import ViolatedError
 from tests.support import cases, some
 
 pytestmark = pytest.mark.computing
@@ -188,7 +189,7 @@ def _retained(drill: Drill, start: float, length: float) -> None:
     """There is a retained command while the robot reconnects."""
     payload = b'{"x": 0, "z": 0.77, "y": 1}'
     drill.at(0.0, lambda: drill.nonsense(payload, retain=True))
-    drill.at(start, drill.drop_robot)
+    drill.at(start, drill.broker.drop_all)
     drill.at(start + length, lambda: drill.nonsense(b"", retain=True))
 
 

@@ -226,40 +226,6 @@ def test_the_motors_come_first(kind: str) -> None:
     assert "ADC" not in [name for name, _ in touched[:4]]
 
 
-#: Volts at pins, the report of them, every how many milliseconds it comes, and other lines: the battery's in 5 s, too.
-REPORTS = {
-    "goob": (
-        {"PA02": 0.825, "PB09": 0.1, "PA11": 1.65, "PB08": 1.4},
-        b"T a0=512 a1=62 a2=1023",
-        20,
-        [b"Starting setup...", b"Done!", b"C chg=-1 v=8.100", b"C chg=-1 v=8.400"],
-    ),
-    "fred": (
-        {"PA02": 0.825, "PB08": 0.1, "PB09": 1.65},
-        b"T t0=512 t1=62 t2=1023 chg=0",
-        500,
-        [b"Starting setup...", b"Done!"],
-    ),
-}
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_what_it_reports_is_exactly_this(kind: str) -> None:
-    volts, report, period_ms, others = REPORTS[kind]
-    bench = Bench(kind)
-    for pin, level in volts.items():
-        bench.board.set_volts(pin, level)
-    if kind == "fred":
-        bench.board.set_pin("PA07", False)
-    lines: list[bytes] = []
-    for ms in range(1, 5010):
-        bench.turn(0.001)
-        came = bench.board.console.take_output().split(b"\r\n")[:-1]
-        assert (report in came) == (ms % period_ms == 0), ms
-        lines += [line for line in came if line != report]
-    assert lines == others
-
-
 def test_half_a_line_of_a_dead_host_moves_nothing(bench: Bench) -> None:
     bench.board.console.type(b"M 0.400 0.")
     bench.turn(0.25)

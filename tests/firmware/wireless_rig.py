@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterable
-from functools import partial
-from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 from pebble.config import Security
 from pebble.contract.identity import Identity
 from pebble.extensions.lab.simulation.fleet import Fleet
 from pebble.extensions.lab.simulation.wireless import KINDS, WirelessRobot
-from pebble.transports import MqttSettings, TlsSettings
+from pebble.transports import MqttSettings
 from tests.support import until
 
 START_S = 10.0
@@ -22,24 +20,14 @@ START_S = 10.0
 class Robots:
     """One of each of these kinds, running. ``moves[kind]`` has each change of its motors, with its time.monotonic()."""
 
-    def __init__(
-        self,
-        host: str,
-        port: int,
-        *,
-        kinds: Iterable[str] = KINDS,
-        security: Security | None = None,
-        ca: Path | None = None,
-        **login: Any,
-    ) -> None:
-        self.fleet = Fleet(MqttSettings(host=host, port=port, tls=ca and TlsSettings(ca_cert=ca), **login))
+    def __init__(self, port: int, *, kinds: Iterable[str] = KINDS) -> None:
+        self.fleet = Fleet(MqttSettings(host="127.0.0.1", port=port))
         self.moves: dict[str, list[tuple[float, tuple[float, float]]]] = {kind: [] for kind in kinds}
         self.robots: dict[str, WirelessRobot] = {}
         for kind, moves in self.moves.items():
-            identity, moved = Identity("pebble", "robots", kind), partial(_note, moves)
-            self.robots[kind] = self.fleet.add(
-                kind, identity, moving_s=0.01, on_motors=moved, security=security or Security()
-            )
+            identity = Identity("pebble", "robots", kind)
+            moved = lambda at, motors, moves=moves: moves.append((at, motors))  # noqa: E731
+            self.robots[kind] = self.fleet.add(kind, identity, moving_s=0.01, on_motors=moved, security=Security())
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
@@ -71,7 +59,3 @@ class Robots:
 
     def _run(self) -> None:
         self.fleet.run(lambda: not self._ending.is_set())
-
-
-def _note(moves: list[tuple[float, tuple[float, float]]], at: float, motors: tuple[float, float]) -> None:
-    moves.append((at, motors))

@@ -309,20 +309,10 @@ class TestEventBuffer:
     @pytest.fixture
     def events(self, remote: Wire, clock: Clock) -> EventBuffer:
         self.counters = Counters()
-        return EventBuffer(remote, self.counters, clock=clock, limit=4)
+        return EventBuffer(remote, self.counters, clock=clock)
 
-    def publish(self, events: EventBuffer, *numbers: int) -> None:
-        for number in numbers:
-            events.send(Message("t", b"%d" % number, QoS.DELIVERED))
-
-    def test_keeps_the_newest_of_an_outage(self, events: EventBuffer, remote: Wire) -> None:
-        remote.up = False
-        events.watch(State.CONNECTING)
-        self.publish(events, 1, 2, 3, 4, 5, 6)
-        remote.up = True
-        events.flush()
-        assert remote.sent == [b"3", b"4", b"5", b"6"]
-        assert self.counters["events_dropped"] == 2
+    def publish(self, events: EventBuffer, number: int) -> None:
+        events.send(Message("t", b"%d" % number, QoS.DELIVERED))
 
     def test_repeats_what_a_dying_link_may_have_swallowed(
         self, events: EventBuffer, remote: Wire, clock: Clock

@@ -261,14 +261,6 @@ class TestWrongBroker:
     def mirror(self, make: Make) -> World:
         return make("mirror")
 
-    @pytest.fixture
-    def apart(self, mirror: World) -> World:
-        """Bridge and mirror, each with a broker of its own."""
-        for service, broker in (("bridge", Hub()), ("mirror", mirror.remote_hub)):
-            mirror.start(service, broker=broker, enabled=True)
-        mirror.run()
-        return mirror
-
     @staticmethod
     def is_mirrored(world: World) -> bool:
         """Whether a command at the mirror's broker arrives, by the mirror or the bridge, and what only it forwards."""
@@ -315,16 +307,19 @@ class TestWrongBroker:
         assert waiting.gate is Gate.OPEN
 
     @pytest.mark.parametrize("topic", ["outgoing/bridge-probe", ONLINE])
-    def test_no_client_of_it_can_stop_the_mirror(self, apart: World, topic: str) -> None:
+    def test_no_client_of_it_can_stop_the_mirror(self, mirror: World, topic: str) -> None:
+        for service, broker in (("bridge", Hub()), ("mirror", mirror.remote_hub)):
+            mirror.start(service, broker=broker, enabled=True)
+        mirror.run()
         nonce = heartbeat(nonce="0123456789abcdef")
         for payload in (b"x", b"", b"x" * 100_000, heartbeat(), nonce, PROBE_REQUEST, *map(heartbeat, range(-9, 1))):
-            apart.remote.publish(topic, payload, retain=payload == nonce)
-            apart.run(0.1)
-        apart.run()
-        assert apart.running[1].gate is Gate.OPEN
-        apart.remote.publish(DRIVE, b"after")
-        apart.run()
-        assert apart.local.payloads(DRIVE) == [b"after"]
+            mirror.remote.publish(topic, payload, retain=payload == nonce)
+            mirror.run(0.1)
+        mirror.run()
+        assert mirror.running[1].gate is Gate.OPEN
+        mirror.remote.publish(DRIVE, b"after")
+        mirror.run()
+        assert mirror.local.payloads(DRIVE) == [b"after"]
 
     @pytest.mark.parametrize("history", ["", "cut mend"], ids=["after a while", "at a reconnect"])
     def test_it_is_checked_again(self, mirror: World, history: str) -> None:

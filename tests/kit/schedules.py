@@ -25,7 +25,7 @@ from typing import Any
 #: The modules that declare an ENGINE, by the name on the command line.
 ENGINES = {
     "motion": "tests.motion.histories",
-    "services": "tests.robot.lockstep.schedules",
+    "services": "tests.robot.lockstep.two_owners",
     "robot": "tests.robot.whole",
 }
 

@@ -6,7 +6,7 @@ import json
 import logging
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from pebble.launcher.reactor import Reactor
 from pebble.runtime.parent import Notifier
 from pebble.transports import Message, QoS, State
 from tests.fakes.recording_transport import RecordingTransport
+from tests.launcher.conftest import lines_of
 from tests.support import until
 
 
@@ -45,8 +46,7 @@ class ConnectedAnnouncer:
         self.pipe.record(message("logs", number))
 
     def sent(self, topic: str) -> list[Any]:
-        lines = self._file.read_text().rpartition("\n")[0].splitlines() if self._file.exists() else []
-        parsed = [json.loads(line) for line in lines]
+        parsed = [json.loads(line) for line in lines_of(self._file)]
         return [line["payload"]["t"] for line in parsed if line["topic"] == topic]
 
     def join(self) -> None:
@@ -70,10 +70,6 @@ def message(topic: str, number: int) -> Message:
     return Message(topic, json.dumps({"t": number}).encode())
 
 
-def becomes(what: Callable[[], list[Any]], expected: list[Any]) -> bool:
-    return until(lambda: what() == expected)
-
-
 def test_states_are_published_again_on_the_next_connection(connected: ConnectedAnnouncer) -> None:
     connected.state(1)
     assert until(lambda: connected.sent("status")[-1:] == [1])
@@ -92,13 +88,13 @@ def test_states_are_published_again_on_the_next_connection(connected: ConnectedA
 
 def test_records_are_published_only_once(connected: ConnectedAnnouncer) -> None:
     connected.record(1)
-    assert becomes(lambda: connected.sent("logs"), [1])
+    assert until(lambda: connected.sent("logs") == [1])
     connected.transport.lose()
     connected.record(2)
     assert until(lambda: connected.transport.counters["refused"] == 1)
     connected.transport.find()
     connected.record(3)
-    assert becomes(lambda: connected.sent("logs"), [1, 3])
+    assert until(lambda: connected.sent("logs") == [1, 3])
 
 
 def test_a_failure_to_publish_does_not_end_it(
@@ -110,7 +106,7 @@ def test_a_failure_to_publish_does_not_end_it(
         connected.state(2)
         assert until(lambda: [record.args for record in caplog.records] == [("logs", 1), ("status", 1)])
     connected.record(3)
-    assert becomes(lambda: connected.sent("logs"), [3])
+    assert until(lambda: connected.sent("logs") == [3])
 
 
 # -- the pipe between launcher and announcer

@@ -22,7 +22,7 @@ from pebble.runtime import notes
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.notes import Feature, Local, Mcu, Note, Reach
 from tests.kit import configs
-from tests.launcher.robot import CONNECTION, Launch
+from tests.launcher.conftest import CONNECTION, Launch
 from tests.support import until
 
 BASE = "pebble/robots/rover"

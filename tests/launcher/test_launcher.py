@@ -19,7 +19,7 @@ from pebble.config import Config, parse
 from pebble.launcher.programs import programs, shared_modules
 from pebble.launcher.run_lock import RunLock
 from tests.fakes.seccomp import CALLS
-from tests.launcher.robot import BASE, CONNECTION, DEVICE, LOCAL_TRANSPORT, Launch, lines_of
+from tests.launcher.conftest import BASE, CONNECTION, DEVICE, LOCAL_TRANSPORT, Launch, lines_of
 from tests.support import ROOT, gone, until
 
 # -- starting

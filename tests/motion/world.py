@@ -16,7 +16,6 @@ from pebble.extensions.lab.simulation.micropython.loader import FirmwareModules
 from pebble.extensions.operator.client.estop import StopSender
 from pebble.transports import Message, QoS
 from tests.kit.schedules import Step, check
-from tests.motion.control_rules import Client, ControlRules
 from tests.motion.rules import (
     GIVE_UP_MS,
     MISSING,
@@ -26,6 +25,8 @@ from tests.motion.rules import (
     UNKNOWN_RUN,
     UNREADABLE,
     WATCHDOG_MS,
+    Client,
+    ControlRules,
     Rules,
 )
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import itertools
 import os
+import secrets
 import shutil
 import signal
+import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
@@ -13,9 +15,11 @@ from dataclasses import dataclass
 from functools import partial
 
 from pebble.config import LAUNCHER_LOCK
+from tests.kit.mqtt_bytes import connect, publish
 from tests.robot.operator import Driver, Operator, number_of
-from tests.robot.rig import STOP, Rig
-from tests.support import until
+from tests.robot.rig import BASE, STOP, Rig
+from tests.support import gone, until
+from tests.transports.net import Forked
 
 AGE_S = 2.5  # no older command ever reaches the wheels
 BACK_S = 5.0  # after the fault's end commands reach the wheels again
@@ -43,7 +47,9 @@ class Drive:
 
     def end(self, over: float) -> None:
         """Wait until commands sent after the fault get through; then let go."""
-        assert until(lambda: self._arrived_after(over), BACK_S), "no driving within 5 s of the fault's end"
+        assert until(lambda: any(self.driver.sent_at[number] >= over for _, number in self._commands(over)), BACK_S), (
+            "no driving within 5 s of the fault's end"
+        )
         self.back_s = time.monotonic() - over
         self.finish()
 
@@ -82,9 +88,6 @@ class Drive:
     def _commands(self, since: float) -> list[tuple[float, int]]:
         return [(at, number_of(*wheels)) for at, wheels in self.rig.mcu.drives(since) if wheels != STOP]
 
-    def _arrived_after(self, since: float) -> bool:
-        return any(self.driver.sent_at[number] >= since for _, number in self._commands(since))
-
 
 def _at(event: tuple[float, bool | None]) -> float:
     return event[0]
@@ -109,7 +112,7 @@ def _launcher_killed(rig: Rig) -> Iterator[None]:
     """Kill the launcher, and start it again, as systemd does."""
     killed, children = time.monotonic(), rig.kill_launcher()
     yield
-    assert until(lambda: not any(map(rig.alive, children)), 1.0), "children outlived their launcher by 1 s"
+    assert until(lambda: all(map(gone, children)), 1.0), "children outlived their launcher by 1 s"
     stopped_at, wheels = rig.mcu.drives(killed)[-1]
     assert wheels == STOP
     assert stopped_at - killed <= 1.0
@@ -178,10 +181,6 @@ def frozen(*pids: int) -> Iterator[None]:
             yield
 
 
-def _robot_frozen(rig: Rig) -> AbstractContextManager[None]:
-    return frozen(*rig.processes().values(), rig.launcher_pid)
-
-
 @dataclass(frozen=True)
 class Fault:
     """A fault that lasts for some seconds. ``turns_s``: how long wheels may turn without another line."""
@@ -217,5 +216,68 @@ FAULTS = {
     "the serial bridge stands still": Fault(
         lambda rig: frozen(rig.processes()[_OWNER]), 2.8, turns_s=_MCU_TURNS_S
     ),
-    "the whole robot stands still": Fault(_robot_frozen, 2.8, turns_s=_MCU_TURNS_S),
+    "the whole robot stands still": Fault(
+        lambda rig: frozen(*rig.processes().values(), rig.launcher_pid), 2.8, turns_s=_MCU_TURNS_S
+    ),
 }  # fmt: skip
+
+
+_SLICE_S = 0.02
+_CONNACK_BYTES = 4
+
+
+@dataclass(frozen=True)
+class Flood:
+    """Messages of a stranger to the robot: ``{n}`` in the topic counts to ``topics`` and begins anew."""
+
+    topic: str
+    payload: bytes
+    per_second: int
+    topics: int = 1
+    retain: bool = False
+
+    def packets(self, first: int, last: int) -> bytes:
+        topics = (self.topic.format(n=number % self.topics) for number in range(first, last))
+        return b"".join(publish(f"{BASE}/{topic}", self.payload, retain=self.retain) for topic in topics)
+
+    def removals(self, sent: int) -> Iterator[bytes]:
+        for number in range(min(sent, self.topics) if self.retain else 0):
+            yield publish(f"{BASE}/{self.topic.format(n=number)}", b"", retain=True)
+
+
+FLOODS = {
+    "retained flags": Flood("incoming/flags/f{n}", b"x" * 100, 6_000, 60_000, retain=True),
+    "retained topics": Flood("incoming/mcu/k/n{n}", b"x" * 20, 10_000, 100_000, retain=True),
+    "actions": Flood("incoming/flags/reboot", b"true", 10_000),
+    "unknown commands": Flood("incoming/unknown/n{n}", b"{}", 5_000, 100_000),
+    "60 MB once a second": Flood("incoming/drive-values", bytes(60 << 20), 1),
+    "a flag of 2 MB": Flood("incoming/flags/large", bytes(2 << 20), 1, retain=True),
+}
+
+
+@contextmanager
+def flooding(name: str, port: int, seconds: float) -> Iterator[Forked]:
+    """Floods from a process of its own, which removes afterwards what was retained; waits for its end."""
+    process = Forked("tests.robot.faults", name, port, seconds)
+    yield process
+    process.wait(seconds + 60)
+
+
+def send(broker: socket.socket, flood: Flood, seconds: float) -> int:
+    """At its pace, as far as the broker reads so fast; returns how many messages that was."""
+    began, sent = time.monotonic(), 0
+    while (passed := time.monotonic() - began) < seconds:
+        due = min(int(passed * flood.per_second) + 1, sent + max(1, flood.per_second // 10))
+        broker.sendall(flood.packets(sent, due))
+        sent = due
+        time.sleep(_SLICE_S)
+    return sent
+
+
+def main(name: str, port: int, seconds: float) -> None:
+    flood = FLOODS[name]
+    with suppress(ConnectionError), socket.create_connection(("127.0.0.1", port)) as broker:
+        broker.sendall(connect(None, None, client_id=f"flood-{secrets.token_hex(4)}"))
+        broker.recv(_CONNACK_BYTES)
+        for packet in flood.removals(send(broker, flood, seconds)):
+            broker.sendall(packet)

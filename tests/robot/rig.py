@@ -20,7 +20,7 @@ from pebble.extensions.lab.rig.processes import children
 from pebble.extensions.lab.simulation.trace import Entry, complete_lines
 from tests.kit.stalls import Stall
 from tests.robot.operator import Operator
-from tests.support import ROOT, Broker, gone, process_name, until
+from tests.support import ROOT, Broker, process_name, until
 from tests.tcp_proxy import TcpProxy
 
 BASE = "pebble/robots/rover"
@@ -142,9 +142,8 @@ class Rig:
         self.local = Broker(self.folder) if kind == "mqtt" or mirror else None
         self.mirror, self._scripts = mirror, scripts
         if scripts:
-            with_paho = (
-                {"follow": {"python": sys.executable}} if "follow" in scripts else {}
-            )  # the system's may lack it
+            # the system's may lack paho
+            with_paho = {"follow": {"python": sys.executable}} if "follow" in scripts else {}
             manager = {"enabled": True, "autonomy_root": "autonomy", "stop_timeout_seconds": 2.0, "scripts": with_paho}
             self._extra = config | {"autonomy_manager": manager | config.get("autonomy_manager", {})}
         for script in scripts:
@@ -272,13 +271,6 @@ class Rig:
         return bool(seen) and set(self._scripts) <= {
             script["file"] for script in seen[-1].json["files"] if script.get("asked", True)
         }
-
-    # -- faults
-
-    @staticmethod
-    def alive(pid: int) -> bool:
-        """Does this process still run? (A zombie does not.)"""
-        return not gone(pid)
 
     def close(self) -> None:
         self.operator.close()

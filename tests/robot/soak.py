@@ -26,8 +26,7 @@ from rich.console import Console
 
 from tests.own_memory import own_mb
 from tests.robot import faults
-from tests.robot.faults import Drive, Fault
-from tests.robot.flood import FLOODS, flooding
+from tests.robot.faults import FLOODS, Drive, Fault, flooding
 from tests.robot.rig import Rig, descendants, restore, saved_by
 from tests.small_disk import SmallDisk
 from tests.support import Broker, process_name, quarters

@@ -76,6 +76,7 @@ def test_an_unplugged_board_is_named_everywhere_until_it_is_back(driven: Rig) ->
     assert driven.shows_driveable("yes")
     pebble("estop", "reset", driven.config, "--remote")
     assert until(lambda: not driven.operator.newest("estop/serial")["latched"])
+    driven.operator.send("incoming/drive-values", {"x": 0, "z": 0})  # after a reset nothing drives before a zero
 
 
 def pebble(*words: object) -> str:

@@ -12,8 +12,7 @@ import pytest
 
 from pebble.config import Config
 from tests.robot.lockstep.drivers import STRANGER
-from tests.robot.lockstep.schedules import ENGINE
-from tests.robot.lockstep.two_owners import FIRST, SECOND, TwoOwners, configuration
+from tests.robot.lockstep.two_owners import ENGINE, FIRST, SECOND, TwoOwners, configuration
 from tests.support import cases
 
 pytestmark = [pytest.mark.computing, pytest.mark.usefixtures("quiet")]

@@ -1,19 +1,21 @@
-"""Pictures and sound of a whole robot, requested by an operator over MQTT with the original Pebble's messages."""
+"""A whole robot's pictures and sound, requested over MQTT with the original Pebble's messages; and its recorder."""
 
 from __future__ import annotations
 
 import re
 import time
+from collections import Counter
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
 from pebble.extensions.media.decode import VideoDecoder
+from pebble.extensions.recordings import library
 from tests.kit.scene import read_counter
 from tests.robot.operator import ReceivedMessage
-from tests.robot.rig import DEVICES, Rig
-from tests.support import until
+from tests.robot.rig import BASE, DEVICES, Rig
+from tests.support import further, until
 
 pytestmark = pytest.mark.alone  # deadlines are checked
 
@@ -61,3 +63,30 @@ def test_stopping_media_does_not_delay_driving_and_leaves_no_shared_memory(kind:
         assert until(lambda: not MEDIA & rig.processes().keys(), 15)
         assert rig.stop() == 0
     assert [path for path in used if Path(path).exists()] == []
+
+
+def counted(folder: Path) -> Counter[tuple[str, str]]:
+    """Messages by topic and connection."""
+    if not list(folder.rglob("*.mcap*")):
+        return Counter()
+    found = library.merged(library.files([folder]))
+    return Counter((message.channel.topic, message.channel.metadata.get("source", "")) for message in found)
+
+
+@pytest.mark.parametrize("kind", [further("mqtt"), "zenoh"])
+def test_what_a_robot_publishes_is_recorded_on_it(kind: str, tmp_path: Path) -> None:
+    folder = tmp_path / "rec"
+    section = {"enabled": True, "folder": str(folder), "free_bytes": 0, "remote": True}
+    with Rig(kind, recorder=section) as rig:
+        assert until(lambda: counted(folder)[f"{BASE}/outgoing/online", "remote"] > 2, 20)  # it reads what is written
+        rig.operator.send("incoming/drive-values", {"x": 0, "z": 0.1})
+        assert until(lambda: rig.mcu.turning(), 10)
+        rig.operator.send("incoming/drive-values", {"x": 0, "z": 0})
+        assert until(lambda: not rig.mcu.turning(), 10)
+        for topic, source, least in (
+            ("incoming/drive-values", "remote", 2),
+            ("incoming/drive-values", "", 2),
+            ("outgoing/status", "", 1),
+        ):
+            assert until(lambda: counted(folder)[f"{BASE}/{topic}", source] >= least, 10), (topic, source)  # noqa: B023
+    assert not list(folder.rglob("*.active"))

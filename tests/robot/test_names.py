@@ -104,34 +104,30 @@ class _By:
         self._rig.send(self._name, suffix.removeprefix("incoming/"), body, **options)
 
 
-@pytest.fixture
-def flooded(tmp_path: Path) -> Iterator[Named]:
-    """A robot of its own: what is left of a flood takes its time."""
-    with Hall(tmp_path / "hall") as hall, Named("zenoh", hall, {"level": "named"}) as one:
-        yield one
+def test_what_another_account_sends_holds_up_no_stop(tmp_path: Path) -> None:
+    """A viewer floods what it may write, requests for pictures of 60 KB: faster than the robot reads.
 
+    The robot is one of its own: what is left of a flood takes its time.
+    """
+    with Hall(tmp_path / "hall") as hall, Named("zenoh", hall, {"level": "named"}) as rig:
+        assert until(lambda: "have a connection of their own" in rig.log.read_text(), 10)
+        ending, sent, took = threading.Event(), itertools.count(), list[float]()
 
-def test_what_another_account_sends_holds_up_no_stop(flooded: Named) -> None:
-    """A viewer floods what it may write, requests for pictures of 60 KB: faster than the robot reads."""
-    rig = flooded
-    assert until(lambda: "have a connection of their own" in rig.log.read_text(), 10)
-    ending, sent, took = threading.Event(), itertools.count(), list[float]()
+        def flood() -> None:
+            place = Place(HOST, rig.remote.port, None)
+            with BrokerClient(place, "vera", rig.hall.passwords["vera"], timeout_s=30) as vera:
+                while not ending.is_set():
+                    vera.publish(f"{BASE}/incoming/by/vera/front-camera", b"[" * 60_000)
+                    next(sent)
 
-    def flood() -> None:
-        place = Place(HOST, rig.remote.port, None)
-        with BrokerClient(place, "vera", rig.hall.passwords["vera"], timeout_s=30) as vera:
-            while not ending.is_set():
-                vera.publish(f"{BASE}/incoming/by/vera/front-camera", b"[" * 60_000)
-                next(sent)
-
-    with beside(flood, ending):
-        began = time.monotonic()
-        while len(took) < 3 or time.monotonic() < began + FLOOD_S:
-            assert until(lambda: next(sent) > 100, 10)
-            name, pressed = f"f{len(took):015x}", time.monotonic()
-            rig.person("mia").send("incoming/estop", {"stop": name})  # once
-            assert until(lambda n=name: n in state_of(rig).get("recent", []), 10), took
-            took.append(time.monotonic() - pressed)
-    assert statistics.median(took) < 1, took
-    order = {one: state_of(rig)[one] for one in ("boot", "count")}
-    assert rig.sends("boss", "estop-reset", order, lambda: not state_of(rig)["latched"], 30), state_of(rig)
+        with beside(flood, ending):
+            began = time.monotonic()
+            while len(took) < 3 or time.monotonic() < began + FLOOD_S:
+                assert until(lambda: next(sent) > 100, 10)
+                name, pressed = f"f{len(took):015x}", time.monotonic()
+                rig.person("mia").send("incoming/estop", {"stop": name})  # once
+                assert until(lambda n=name: n in state_of(rig).get("recent", []), 10), took
+                took.append(time.monotonic() - pressed)
+        assert statistics.median(took) < 1, took
+        order = {one: state_of(rig)[one] for one in ("boot", "count")}
+        assert rig.sends("boss", "estop-reset", order, lambda: not state_of(rig)["latched"], 30), state_of(rig)

@@ -1,4 +1,7 @@
-"""Scripts of a whole robot: the wheels rest however one ends, and a person goes first. Times by the MCU's trace."""
+"""A few random schedules with whole robots (``python -m tests.kit.schedules robot`` runs hundreds), and scripts.
+
+The wheels rest however a script ends, and a person goes first. Times by the MCU's trace.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +17,17 @@ from typing import Any
 import pytest
 
 from tests.robot.rig import STOP, Rig
+from tests.robot.whole import ENGINE
 from tests.support import further, gone, until
 
 pytestmark = pytest.mark.alone  # deadlines are checked
+
+
+@pytest.mark.parametrize(("kind", "seed"), [("zenoh", 2), *(further(kind, 1) for kind in ENGINE.kinds)])
+def test_what_people_and_owners_do_is_seen_at_the_wheels(kind: str, seed: int) -> None:
+    (result,) = ENGINE.run(kind, seed, range(1))
+    assert not result.problems, f"{result.problems}\n{result.log}"
+
 
 DRIVE, CONTROL = "incoming/drive-values", "incoming/control"
 CRUISE = {"x": 0.0, "z": -0.3}

@@ -1,18 +1,21 @@
-"""Robots that start and stop in odd surroundings: without an environment, at any moment, several at once."""
+"""Robots that start and stop in odd surroundings, several at once, and among malformed messages."""
 
 from __future__ import annotations
 
+import itertools
 import os
 import resource
 import signal
 import subprocess
 import time
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from pebble.contract import CHANNELS, ESTOP, INCOMING
 from tests.robot.rig import STOP, Rig, descendants
-from tests.support import ROOT, further, gone, some, until
+from tests.support import ROOT, cases, further, gone, some, until
 
 pytestmark = pytest.mark.alone
 
@@ -90,3 +93,57 @@ def test_a_hurried_stop_stops_the_wheels(kind: str, options: dict[str, Any], sig
         rig.stop(*[signal.SIGTERM] * signals)
         assert until(lambda: all(map(gone, children)))
         assert until(lambda: not rig.mcu.turning(), 2.0)
+
+
+MESSAGES = cases(1_600, 20_000)
+CHUNK = 800  # messages before waiting for a sign that the robot has read them: less than any queue on the way holds
+
+#: No channel accepts one of these.
+GARBAGE = (
+    *(b"\xff\xfe\0", b"not json", b"[1, 1]", b"1", b"-0", b'"true"', b'"on"', b"null", b"[true]", b"TRUE", b"1.5e308"),
+    *(b"[" * 3000, b'{"value":' * 2000, b"[" * 3000 + b"]" * 3000, b'{"x": 1, "value": true, "n": "\xff\xfe"}'),
+    *(b'{"value": {"x": 0.5, "z": 0.5, "action": "pl', b'{"x": 1', b'{"x": "' + b"9" * 900),
+)
+
+#: Without emergency stops: there garbage is a stop, too (tests/services/serial_mcu_bridge).
+_TARGETS = [
+    channel
+    for channel in CHANNELS
+    if channel.direction == INCOMING and channel.payload is not bytes and channel is not ESTOP
+]
+
+
+@pytest.mark.timeout(180)
+@pytest.mark.parametrize("kind", ["mqtt", "zenoh"])
+def test_malformed_messages(kind: str) -> None:
+    with Rig(kind) as rig:
+        kinds = itertools.cycle(itertools.product(GARBAGE, _TARGETS))
+        processes, memory, began = rig.processes(), _memory(rig), time.monotonic()
+        for first in range(0, MESSAGES, CHUNK):
+            for raw, channel in itertools.islice(kinds, CHUNK):
+                topic = channel.suffix.format(uid="u", name="n", outlet="o1", robot="r")
+                rig.operator.send(topic, raw, qos=0)
+            assert _still_responds(rig, first / MESSAGES), f"no response after {first + CHUNK} messages"
+        assert rig.processes() == processes
+        assert not rig.mcu.moving(began)
+        assert rig.recorded() == []
+        assert _memory(rig) - memory < 30 * 1024, "memory grew by more than 30 MB"
+        assert until(
+            lambda: any("refused" in seen.json["message"] for seen in rig.operator.on("outgoing/logs", began)), 10
+        )
+        assert rig.stop() == 0
+        assert "refused in all: {" in rig.log.read_text()
+
+
+def _still_responds(rig: Rig, shade: float) -> bool:
+    """A good message behind all the bad ones still arrives."""
+    began = time.monotonic()
+    rig.operator.send("incoming/lights-solid", {"g": round(shade, 3)})
+    line = f"L 0.000 {shade:.3f} 0.000"
+    return until(lambda: any(entry.line == line for entry in rig.mcu.entries(began)), 20)
+
+
+def _memory(rig: Rig) -> int:
+    """Resident memory of all the robot's processes, KB."""
+    pages = sum(int(Path(f"/proc/{pid}/statm").read_text().split()[1]) for pid in rig.processes().values())
+    return pages * os.sysconf("SC_PAGE_SIZE") // 1024

@@ -24,11 +24,10 @@ from pebble.extensions.operator.client.estop import StopSender, new_name
 from pebble.transports import Message
 from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps
 from tests.kit.stalls import Stalls, lost_s
-from tests.robot.alive import Alive
 from tests.robot.operator import Operator, ReceivedMessage
 from tests.robot.rig import BASE, Rig, descendants, restore, saved_by
-from tests.robot.whole_rules import History, Seen, by_script
-from tests.support import Broker, until
+from tests.robot.whole_rules import Alive, History, Seen, by_script
+from tests.support import Broker, gone, until
 
 STATE, STOPPED = "outgoing/control/serial", "outgoing/estop/serial"
 SPEEDS = {"ann": 0.3, "otto": 0.5}
@@ -275,7 +274,7 @@ class World:
         return pids
 
     def _start_again(self, left: list[int]) -> None:
-        until(lambda: not any(self.rig.alive(pid) for pid in left), 5)
+        until(lambda: all(map(gone, left)), 5)
         self.rig.start(ready=False)
 
     def do_freeze(self, _: Person, b: int) -> None:

@@ -295,9 +295,7 @@ def run_when_idle(service: Service, job: Callable[[], None]) -> bool:
 
 def test_a_service_that_works_or_hangs_takes_no_work_of_other_threads(idle: Robot) -> None:
     ran: list[str] = []
-    idle.service.go_on.clear()
-    idle.publish(DRIVE_TOPIC, '{"x": 0.5}')
-    assert idle.saw(0.5)
+    idle.keep_busy(DRIVE_TOPIC, '{"x": 0.5}', 0.5)
     assert not idle.service.run_if_idle(lambda: ran.append("visitor"))
     idle.service.go_on.set()
     assert run_when_idle(idle.service, lambda: ran.append("visitor"))
@@ -328,9 +326,7 @@ def test_work_of_another_thread_that_fails_ends_the_service_and_not_that_thread(
 
 
 def test_of_several_waiting_drive_commands_only_the_newest_is_handled(running: Robot) -> None:
-    running.service.go_on.clear()
-    running.publish(DRIVE_TOPIC, '{"x": 0.01}')
-    assert running.saw(0.01)
+    running.keep_busy(DRIVE_TOPIC, '{"x": 0.01}', 0.01)
     for number in range(1, 100):
         running.publish(DRIVE_TOPIC, f'{{"x": {number / 100}}}')
     running.publish(REBOOT_TOPIC, "true")
@@ -407,10 +403,6 @@ def test_a_malformed_message_is_counted_logged_once_and_replaces_nothing(
 # -- publishing
 
 
-def charging(value: bool) -> ChargingStatus:
-    return ChargingStatus(value=value)
-
-
 def test_the_handler_of_a_pattern_receives_the_names_in_the_topic(running: Robot) -> None:
     running.publish(f"{BASE}/outgoing/media-report/", '{"running": true}', retain=True)
     running.publish(MEDIA_REPORT.topic(BASE, program="camera_publisher"), '{"running": true}')
@@ -437,7 +429,7 @@ def test_a_channel_made_while_running_is_received_until_its_subscription_is_clos
 
 def test_state_is_published_again_after_a_reconnect_and_streams_and_what_was_retracted_are_not(running: Robot) -> None:
     touch, topic = TouchSensors(value=TouchValues(a0=1, a1=2, a2=3)), f"{BASE}/outgoing/lab/lamp"
-    for publication in ((GLOW, {"on": True}), (TOUCH_SENSORS, touch), (CHARGING_STATUS, charging(False))):
+    for publication in ((GLOW, {"on": True}), (TOUCH_SENSORS, touch), (CHARGING_STATUS, ChargingStatus(value=False))):
         running.on_service_thread(lambda publication=publication: running.service.publish(*publication))  # type: ignore[misc]
     assert until(lambda: running.received_on(topic) and running.received_on(CHARGING_TOPIC))
     assert running.hub.retained[topic].payload == b'{"on":true}'
@@ -451,7 +443,7 @@ def test_state_is_published_again_after_a_reconnect_and_streams_and_what_was_ret
     assert topic not in running.hub.retained
     running.hub.stop(forget=True)
     assert until(lambda: running.service.transport.state is State.CONNECTING)
-    running.on_service_thread(lambda: running.service.publish(CHARGING_STATUS, charging(True)))
+    running.on_service_thread(lambda: running.service.publish(CHARGING_STATUS, ChargingStatus(value=True)))
     running.received.clear()
     running.hub.start()
     assert until(lambda: running.received_on(CHARGING_TOPIC))
@@ -465,7 +457,7 @@ def test_a_service_lives_without_a_broker() -> None:
     thread = threading.Thread(target=robot.service.run)
     thread.start()
     assert until(lambda: robot.service.ticks > 3)
-    robot.service.post(lambda: robot.service.publish(CHARGING_STATUS, charging(True)) and None)
+    robot.service.post(lambda: robot.service.publish(CHARGING_STATUS, ChargingStatus(value=True)) and None)
     robot.operator.subscribe(f"{BASE}/outgoing/#", robot.received.append)
     robot.hub.start()
     assert until(lambda: len(robot.received_on(CHARGING_TOPIC)) > 3), "again and again"

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.transports.net import Net
-from tests.transports.plain_nets import MemoryNet, MqttNet, PahoNet
+from tests.transports.net import MemoryNet, MqttNet, Net, PahoNet
 from tests.transports.zenoh_net import ZenohNet
 
 NETS: dict[str, Callable[[Path], Net]] = {

@@ -15,7 +15,7 @@ from pebble.runtime.parent import end_with_parent
 _context = multiprocessing.get_context("forkserver")
 _context.set_forkserver_preload(
     [
-        *("__main__", "tests.ext.media.frames.frames_peer", "tests.transports.peer", "pebble.extensions.lab.rig.hub"),
+        *("__main__", "tests.ext.media.frames.frames_peer", "tests.transports.net", "pebble.extensions.lab.rig.hub"),
         "tests.kit.robot",
     ]
 )

@@ -6,14 +6,16 @@ runs as long as a module's tests of one kind; `close_clients` ends what one test
 
 from __future__ import annotations
 
-import base64
 import json
-import pickle
+import sys
+import tomllib
 from abc import ABC, abstractmethod
+from pathlib import Path
 from typing import Any, ClassVar
 
-from pebble.transports import Message, QoS, State, Transport, create
-from tests.support import until
+from pebble.transports import GROUP, Message, MqttSettings, QoS, State, Transport, create
+from pebble.transports.memory import MemoryHub, MemoryTransport
+from tests.support import ROOT, Broker, until
 from tests.transports.forked import Forked
 
 
@@ -106,11 +108,10 @@ class Net(ABC):
 
 
 class ProcessPeer:
-    """Runs tests/transports/peer.py and talks to it in lines of JSON."""
+    """A client in a process of its own (:func:`main`), asked in lines of JSON."""
 
     def __init__(self, kind: str, name: str, settings: Any, will: Message | None) -> None:
-        recipe = base64.b64encode(pickle.dumps((kind, name, settings, will))).decode()
-        self._process = Forked("tests.transports.peer", recipe)
+        self._process = Forked("tests.transports.net", kind, name, settings, will)
         assert self._answer() is True, "the peer did not connect"
         self.pid = self._process.pid
 
@@ -150,6 +151,31 @@ class ProcessPeer:
             pipe.close()
 
 
+def main(kind: str, name: str, settings: Any, will: Message | None) -> None:
+    """Follow the commands in lines of JSON on stdin."""
+    client, received = create(kind, name, settings, will=will).open(10), list[Message]()
+    _report(client.state is State.CONNECTED)
+    for line in sys.stdin:
+        request = json.loads(line)
+        if "close" in request:
+            client.close()
+            _report(True)
+            return
+        if "listen" in request:
+            client.subscribe("#", received.append)
+            _report(True)
+        elif "heard" in request:
+            _report([len(received), received[-1].payload.decode() if received else ""])
+        else:
+            payload = bytes.fromhex(request["payload"])
+            _report(client.publish(request["topic"], payload, qos=QoS(request["qos"]), retain=request["retain"]))
+
+
+def _report(answer: object) -> None:
+    sys.stdout.write(json.dumps(answer) + "\n")
+    sys.stdout.flush()
+
+
 class Received:
     """A handler that remembers: call it with messages; look at what came."""
 
@@ -166,3 +192,120 @@ class Received:
     def until(self, *payloads: bytes, timeout: float = 10.0) -> bool:
         """Have exactly these payloads arrived, in this order?"""
         return until(lambda: self.payloads == list(payloads), timeout)
+
+
+class MemoryNet(Net):
+    kind = "memory"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._hub = MemoryHub()
+
+    def settings(self, **_changes: Any) -> Any:
+        return self._hub
+
+    def portable_settings(self) -> Any:
+        return MemoryHub()
+
+    def start_network(self) -> None:
+        self._hub.start()
+
+    def stop_network(self, *, forget: bool = False) -> None:
+        self._hub.stop(forget=forget)
+
+    def freeze_network(self) -> None:
+        """There is no connection that could stay open without answering: an outage is all there can be."""
+        self._hub.stop()
+
+    def thaw_network(self) -> None:
+        self._hub.start()
+
+    def heal(self) -> None:
+        if self._hub.era is None:
+            self._hub.start()
+
+    def peer(self, name: str, *, will: Message | None = None) -> Any:
+        client = self.client(name, will=will)
+        assert isinstance(client, MemoryTransport)
+        return MemoryPeer(self._hub, client)
+
+
+class MemoryPeer:
+    """Dies by being forgotten."""
+
+    def __init__(self, hub: MemoryHub, client: MemoryTransport) -> None:
+        self._hub, self._client = hub, client
+
+    def publish(self, topic: str, payload: bytes, *, qos: QoS = QoS.DELIVERED, retain: bool = False) -> bool:
+        return self._client.publish(topic, payload, qos=qos, retain=retain)
+
+    def kill(self) -> None:
+        if self._client.state is not State.CLOSED:
+            self._hub.crash(self._client)
+
+    def close(self) -> None:
+        self._client.close()
+
+
+class MqttNet(Net):
+    kind = "mqtt"
+    patient: ClassVar[dict[str, Any]] = {"silence_s": 20.0}
+
+    def __init__(self, folder: Path, protocol: str) -> None:
+        super().__init__()
+        self._protocol = protocol
+        self._broker = Broker(folder, persistence=True)
+
+    def settings(self, **changes: Any) -> Any:
+        settings = {"host": "127.0.0.1", "port": self._broker.port, "protocol": self._protocol, **changes}
+        return MqttSettings(**settings)
+
+    def echoless_settings(self) -> Any:
+        return self.settings(as_published=True)
+
+    def start_network(self) -> None:
+        if not self._broker.running:
+            self._broker.start()
+
+    def stop_network(self, *, forget: bool = False) -> None:
+        if self._broker.running:
+            self._broker.save()
+            self._broker.kill()
+        if forget:
+            self._broker.forget()
+
+    def freeze_network(self) -> None:
+        self._broker.freeze()
+
+    def thaw_network(self) -> None:
+        self._broker.thaw()
+
+    def heal(self) -> None:
+        if self._broker.running:
+            self._broker.thaw()
+        else:
+            self._broker.start()
+
+    def stop(self) -> None:
+        self.close_clients()
+        self._broker.kill()
+
+
+class PahoNet(MqttNet):
+    """The same broker, and the transport of the extension, found as that of a package that is installed."""
+
+    kind = "paho"
+
+    def __init__(self, folder: Path, protocol: str) -> None:
+        super().__init__(folder, protocol)
+        points = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"][GROUP]
+        self._offers = folder / "offers"
+        package = self._offers / "extension-1.dist-info"
+        package.mkdir(parents=True)
+        (package / "METADATA").write_text("Name: extension\nVersion: 1\n")
+        (package / "entry_points.txt").write_text(f"[{GROUP}]\npaho = {points['paho']}\n")
+        sys.path.append(str(self._offers))
+
+    def stop(self) -> None:
+        super().stop()
+        sys.path.remove(str(self._offers))

@@ -222,12 +222,8 @@ def test_a_third_party_registers_through_an_entry_point(monkeypatch: pytest.Monk
     assert {"memory", "mqtt", "theirs", "zenoh"} <= set(str(refused.value).partition("known are ")[2].split(", "))
 
 
-def not_a_transport(client_id: str, settings: object, *, will: object) -> str:
-    return client_id
-
-
 def test_what_is_not_a_transport_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    install(monkeypatch, "tests.transports.test_base:not_a_transport")
+    install(monkeypatch, "unittest.mock:Mock")
     with pytest.raises(TransportError, match="is not a pebble"):
         create("theirs", "client", None)
 
@@ -264,10 +260,6 @@ def test_nothing_below_1_2() -> None:
         assert agreed(version) == version.name.replace("_", ".")
 
 
-def _number(file: Path) -> int:
-    return int(file.read_text())
-
-
 def _replaced(file: Path, text: str) -> None:
     fresh = file.with_name("fresh")
     fresh.write_text(text)
@@ -299,7 +291,7 @@ def test_a_change_is_taken_up_and_what_cannot_be_used_is_not(
     file = tmp_path / "certs" / "number"
     file.parent.mkdir()
     file.write_text("1")
-    value = Renewed([file], lambda: _number(file))
+    value = Renewed([file], lambda: int(file.read_text()))
     change(file)
     assert [value.get() for _ in range(3)] == [expected] * 3
     assert len([record for record in caplog.records if record.levelname == "WARNING"]) <= 1

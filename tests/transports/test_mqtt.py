@@ -102,9 +102,6 @@ def topic(request: pytest.FixtureRequest) -> str:
     return "mqtt/" + request.node.name.replace("[", "/").rstrip("]")
 
 
-both_protocols = pytest.mark.parametrize("protocol", ["3.1.1", "5"])
-
-
 def reconnected(client: Transport, times: int = 2) -> bool:
     return until(lambda: client.counters["connected"] >= times and client.state is State.CONNECTED)
 
@@ -112,22 +109,7 @@ def reconnected(client: Transport, times: int = 2) -> bool:
 # -- as published
 
 
-@both_protocols
-def test_as_published_shows_what_was_published_with_retain(
-    broker: Broker, clients: Clients, topic: str, protocol: str
-) -> None:
-    bridge = clients(broker.port, "bridge", as_published=True, protocol=protocol)
-    other, received = clients(broker.port), Received()
-    assert bridge.as_published
-    assert bridge.exact_echo
-    bridge.subscribe(topic, received, echo=False)
-    other.publish(topic, b"fleeting", qos=DELIVERED)
-    other.publish(topic, b"kept", qos=DELIVERED, retain=True)
-    assert received.until(b"fleeting", b"kept")
-    assert [(one.retain, one.retain_requested) for one in received.messages] == [(False, False), (True, True)]
-
-
-@both_protocols
+@pytest.mark.parametrize("protocol", ["3.1.1", "5"])
 def test_subscribe_returns_after_the_retained_messages_however_long_after_the_suback(
     broker: Broker, clients: Clients, protocol: str
 ) -> None:
@@ -357,7 +339,7 @@ def refusing(tmp_path: Path) -> Iterator[RefusingBroker]:
     broker.stop()
 
 
-@both_protocols
+@pytest.mark.parametrize("protocol", ["3.1.1", "5"])
 def test_a_refused_subscription_is_known_at_once_and_renewed_with_every_connection(
     refusing: RefusingBroker, clients: Clients, topic: str, protocol: str, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -72,11 +72,6 @@ def test_the_bodies_of_an_inertial_sensor(memory_rig: SerialRig) -> None:
         "goob-imu-nano", "imu_fast", "imu.motion.v1",
     )  # fmt: skip
     assert generic["value"]["ax"] == 9.807
-    out = f"{memory_rig.base}/outgoing/"
-    qos = {m.topic.removeprefix(out): (int(m.qos), m.retain_requested) for m in memory_rig.world.received}
-    assert qos["mcu/goob-imu-nano/imu_fast"] == qos["sensors/imu-fast"] == (0, False)
-    assert qos["mcu/goob-imu-nano/imu"] == qos["sensors/imu"] == (1, False)
-    assert qos["mcu/goob-imu-nano/describe"] == (1, True)
 
 
 def test_qos_and_retain_follow_the_interface(rig: SerialRig) -> None:
@@ -165,13 +160,6 @@ def test_of_a_group_a_board_gets_all_its_commands_in_a_write_or_none(
     memory_rig.world.command("mcu/hs105-sta/o4_set", {"on": True})
     assert mcu.obeyed(len(obeyed) + 1) == [*obeyed, (7, b"\1")]
     assert len(written) == 1 + bool(obeyed)
-
-
-def test_without_the_key_a_board_takes_no_groups(memory_rig: SerialRig) -> None:
-    mcu, _ = memory_rig.up(STATION)
-    memory_rig.world.command("group", GOOD)
-    memory_rig.world.command("mcu/hs105-sta/o4_set", {"on": True, "group": True})
-    assert mcu.obeyed() == [(7, b"\1")]
 
 
 # -- plugging in and out, restarts and new firmware

@@ -153,7 +153,7 @@ class Lan(Gateways):
         stack.callback(near.kill)
         neighbours = {LAMP: {"lan": {"connect": [self.endpoint]}, **GRANT}}
         self.gateway = self.start("gate-1", boards={"host": "127.0.0.1", "port": near.port}, neighbours=neighbours)
-        self.board = stack.enter_context(Robots("127.0.0.1", near.port, kinds=("minilamp",)))
+        self.board = stack.enter_context(Robots(near.port, kinds=("minilamp",)))
         client = self.client("goob-lan")
         self.goob = One(folder / "goob", client, "goob", stack, listens={"minilamp": [ONLINE.metric]})
         self.received: list[Message] = []

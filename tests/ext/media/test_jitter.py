@@ -210,16 +210,13 @@ def test_large_packets_are_limited_by_their_bytes() -> None:
     assert len(buffer) == 5
 
 
-def _with_index(played: Played) -> list[tuple[tuple[float, Chunk], int]]:
-    return [((at, chunk), int(chunk.samples[-1, 0])) for at, chunk in played.chunks if not chunk.concealed]
-
-
 def test_a_sender_whose_clock_is_fast_adds_no_latency() -> None:
     drift, count = 0.001, 6_000  # two minutes
     arrivals = [(at / (1 + drift), raw) for at, raw in on_time(count)]
     buffer = JitterBuffer()
     played = play(buffer, arrivals)
-    latency = [at - 0.02 * index / (1 + drift) for (at, _), index in _with_index(played)]
+    indices = [(at, int(chunk.samples[-1, 0])) for at, chunk in played.chunks if not chunk.concealed]
+    latency = [at - 0.02 * index / (1 + drift) for at, index in indices]
     assert max(latency) < 0.12
     assert 0 < buffer.counters["skipped"] <= drift * count + 2
     assert buffer.counters["overflow"] == 0

@@ -254,17 +254,16 @@ def test_what_is_no_sound_is_refused(tmp_path: Path, ending: str, content: bytes
         samples(path)
 
 
-_CODECS = {".mp3": "libmp3lame", ".ogg": "libopus", ".flac": "flac"}
-_FORMATS = {"libmp3lame": "s16p", "libopus": "s16", "flac": "s16"}
+_CODECS = {".mp3": "libmp3lame", ".ogg": "libopus", ".flac": "flac", ".wav": "pcm_s16le"}
 
 
 def encode(path: Path, samples: Samples, rate: int) -> Path:
     """``samples`` are (samples, channels); one or two channels. Ogg holds Opus, which is decoded at 48 kHz."""
-    codec, layout = _CODECS[path.suffix], "mono" if samples.shape[1] == 1 else "stereo"
+    codec, layout = _CODECS[path.suffix.lower()], "mono" if samples.shape[1] == 1 else "stereo"
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=rate, layout=layout)
-        stream.format = _FORMATS[codec]
-        resampler = av.AudioResampler(format=_FORMATS[codec], layout=layout, rate=rate)
+        stream.format = form = "s16p" if codec == "libmp3lame" else "s16"
+        resampler = av.AudioResampler(format=form, layout=layout, rate=rate)
         for start in range(0, len(samples), 1024):
             piece = np.ascontiguousarray(samples[start : start + 1024]).reshape(1, -1)
             frame = av.AudioFrame.from_ndarray(piece, format="s16", layout=layout)

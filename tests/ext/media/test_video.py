@@ -223,10 +223,6 @@ def send(encoder: VideoEncoder, count: int, first: int = 0, **asked: bool) -> li
     return [encoder.encode(picture(n), T0 + n * 66, **asked) for n in range(first, first + count)]
 
 
-def _squared_error(one: Pixels, other: Pixels) -> float:
-    return cv2.norm(one, other, cv2.NORM_L2SQR) / one.size
-
-
 @pytest.mark.parametrize("name", FORMS)
 def test_what_is_sent_is_shown(name: str) -> None:
     """A view that may only be read is enough for it."""
@@ -300,7 +296,7 @@ def test_errors_do_not_pile_up_between_key_frames() -> None:
     for number, packet in enumerate(send(encoder, 30)):
         shown = decoder.feed(packet)
         assert shown is not None
-        errors.append(_squared_error(shown.picture, picture(number)))
+        errors.append(cv2.norm(shown.picture, picture(number), cv2.NORM_L2SQR))
     assert max(errors) < 1.5 * errors[0]
 
 

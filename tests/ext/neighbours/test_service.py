@@ -317,10 +317,6 @@ class Fred:
         self.local = next(self._runs)
         self.publish(Drive(source=SCRIPT, run=self.local))
 
-    def script_drives(self) -> None:
-        assert self.local is not None
-        self.publish(Drive(z=0.2, source=SCRIPT, run=self.local), "own script")
-
     def script_ended(self) -> None:
         self.script()
         self.wait(1)
@@ -389,7 +385,7 @@ def test_fred_s_own_script_is_never_barred(fred: Fred) -> None:
     for run in range(8, 20):
         fred.goob(run=run, seconds=0.2)
         fred.moved.clear()
-        fred.script_drives()
+        fred.publish(Drive(z=0.2, source=SCRIPT, run=fred.local), "own script")
         assert fred.moved == ["own script"]
 
 

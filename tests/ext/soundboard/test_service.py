@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import sys
-import wave
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -43,12 +42,7 @@ def tone(seconds: float, channels: int = 1, rate: int = RATE) -> Samples:
 
 def write_wav(path: Path, samples: Samples, rate: int = RATE) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    with wave.open(str(path), "wb") as file:
-        file.setnchannels(samples.shape[1])
-        file.setsampwidth(2)
-        file.setframerate(rate)
-        file.writeframes(samples.astype("<i2").tobytes())
-    return path
+    return encode(path, samples, rate)
 
 
 class Soundboard(ProgramRobot):
@@ -153,11 +147,6 @@ def make(local: Broker) -> Iterator[Make]:
         yield made
 
 
-@pytest.fixture(params=["mqtt", "zenoh"])
-def both(request: pytest.FixtureRequest, make: Make) -> Soundboard:
-    return make(request.param)
-
-
 @pytest.fixture
 def board(make: Make) -> Soundboard:
     return make()
@@ -166,7 +155,9 @@ def board(make: Make) -> Soundboard:
 PLAY, STOP = ["play", "start", "on", "enable", "enabled"], ["stop", "off", "disable", "disabled"]
 
 
-def test_a_clip_is_listed_played_as_it_is_and_over(both: Soundboard) -> None:
+@pytest.mark.parametrize("kind", ["mqtt", "zenoh"])
+def test_a_clip_is_listed_played_as_it_is_and_over(make: Make, kind: str) -> None:
+    both = make(kind)
     path = write_wav(both.sounds / "intro.wav", tone(0.4, 2))
     write_wav(both.sounds / "warn" / "ba\u0308r.WAV", tone(0.1))
     (both.sounds / "notes.txt").write_text("no sound")

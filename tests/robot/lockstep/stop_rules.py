@@ -20,10 +20,9 @@ from msgspec import UNSET
 from pebble.contract import ESTOP, ESTOP_RESET, ESTOP_STATE, codec
 from pebble.contract.payloads import EstopState
 from pebble.transports import Message
-from tests.robot.lockstep.bridge import Bridge
 from tests.robot.lockstep.drivers import BASE
 from tests.robot.lockstep.network import Scheduler
-from tests.robot.lockstep.owner import Owner
+from tests.robot.lockstep.owner import Bridge, Owner
 
 _LATCHES_S = 2.5  # a state and a repetition each may travel for 0.7 s
 _REPEAT_S = 0.5

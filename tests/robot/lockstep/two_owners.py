@@ -30,12 +30,10 @@ from pebble.config import Config, load
 from pebble.contract import CONTROL_STATE, CONTROL_TURN, CONTROL_VOUCHED, ESTOP_STATE, codec
 from pebble.runtime.process import view_of
 from pebble.transports import Message, QoS
-from tests.kit.schedules import RandomSteps
-from tests.robot.lockstep.bridge import Bridge, Outside
-from tests.robot.lockstep.drivers import BASE, SCRIPT, STRANGER, Commands, Driver
-from tests.robot.lockstep.holders import Holders
+from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps, perform_steps
+from tests.robot.lockstep.drivers import BASE, SCRIPT, STRANGER, Commands, Driver, Holders
 from tests.robot.lockstep.network import Network, Process, Scheduler
-from tests.robot.lockstep.owner import Disk, Owner, Wheels
+from tests.robot.lockstep.owner import Bridge, Disk, Outside, Owner, Wheels
 from tests.robot.lockstep.stop_rules import StopRules
 
 FIRST, SECOND = "arm", "serial"  # in the config the second comes first
@@ -156,16 +154,14 @@ class TwoOwners:
     def _turned(self, owner: Owner) -> None:
         late = self.scheduler.now > owner.wheels.deadline + _MS
         self.scheduler.check(not late or owner.wheels.speeds is None, "a wheel turns after its command's deadline")
-        self._check_lights(owner.wheels)
-        self.check()
-
-    def _check_lights(self, wheels: Wheels) -> None:
+        wheels = owner.wheels
         if wheels.speeds is not None:
             left, right = wheels.speeds
             lights = b"L 1.000 %.3f %.3f\n" % (left / 1000, right / 1000)
             expected = lights if wheels.speeds in self.commands.grouped else b""
             self.scheduler.check(wheels.lights == expected, "half a group is obeyed")
         self.scheduler.check(not wheels.alone, "the copy of a member is obeyed, too")
+        self.check()
 
     def _check_again(self) -> None:
         self.check()
@@ -306,17 +302,13 @@ class TwoOwners:
         if self.bridge is None or not self.bridge.alive or self.bridge.frozen:
             return
         if a % 4 == 0:
-            self.kill_bridge(_DOWN_S[b % len(_DOWN_S)])
+            assert self.stops is not None
+            self.bridge.kill(_DOWN_S[b % len(_DOWN_S)])
+            self.stops.begin()
         elif a % 4 == 1:
             self.freeze(self.bridge, _FROZEN_S[b % len(_FROZEN_S)])
         else:
             self.bridge.lose(_LOST_S[b % len(_LOST_S)], local=a % 8 == 2)
-
-    def kill_bridge(self, seconds: float) -> None:
-        assert self.bridge is not None
-        assert self.stops is not None
-        self.bridge.kill(seconds)
-        self.stops.begin()
 
     def do_delay(self, a: int, b: int) -> None:
         process: Process = self._anybody(a) if a % 2 else self._owner(a // 2)
@@ -428,3 +420,19 @@ def configs(*, groups: bool = False) -> Iterator[tuple[Config, ...]]:
         yield tuple(
             configuration(Path(folder), strangers, bridged=bridged, groups=groups) for strangers, bridged in kinds
         )
+
+
+def _perform(configs: tuple[Config, ...], schedule: Steps) -> Outcome:
+    layout, steps = schedule
+    world = TwoOwners(layout, configs)
+    perform_steps(world, steps)
+    world.rest()
+    return Outcome()
+
+
+ENGINE = Engine(
+    draw=STEPS,
+    world=lambda kind: configs(groups=kind == "groups"),  # what schedules share
+    perform=_perform,
+    kinds=("owners", "groups"),
+)

@@ -105,7 +105,7 @@ class MemoryRig:
         self.robot_side = MemoryTransport("local-bridge", self.local_hub)
         bridge = MqttBridge(make_config(**section), self.robot_side)
         self._running.append(Running(bridge))
-        assert until(lambda: gate_of(bridge) is Gate.OPEN and bridge.status.subscribed == {*Side})
+        assert until(lambda: bridge.status.gate is Gate.OPEN and bridge.status.subscribed == {*Side})
         return bridge
 
     def close(self) -> None:
@@ -116,10 +116,6 @@ class MemoryRig:
 
     def _remote_transport(self, _config: Config, name: str, *, will: Message | None = None) -> MemoryTransport:
         return MemoryTransport(name, self.remote_hub, will=will)
-
-
-def gate_of(bridge: MqttBridge) -> Gate:
-    return bridge.status.gate
 
 
 class Quiet:

@@ -124,11 +124,8 @@ class Bench:
     def stopped(self) -> bool:
         return until(lambda: self.state.get("latched") and self.state["persisted"], 5)
 
-    def send_reset(self) -> None:
-        self.send("estop-reset", {"boot": self.state["boot"], "count": self.state["count"], "by": "eve"})
-
     def reset(self) -> bool:
-        self.send_reset()
+        self.send("estop-reset", {"boot": self.state["boot"], "count": self.state["count"], "by": "eve"})
         return until(lambda: not self.state["latched"], 5)
 
     def stop(self) -> None:

@@ -5,7 +5,7 @@ import threading
 import time
 import tty
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 
 import pytest
@@ -230,13 +230,6 @@ class StuckDevice:
         os.close(self._slave)
 
 
-@pytest.fixture
-def stuck() -> Iterator[StuckDevice]:
-    device = StuckDevice()
-    yield device
-    device.close()
-
-
 def fill(host: Host) -> float:
     """Send drive lines until the kernel's buffer is full; return the duration of the longest call in seconds."""
     longest = 0.0
@@ -248,23 +241,24 @@ def fill(host: Host) -> float:
 
 
 def test_a_stuck_reader_does_not_block_and_finds_no_old_commands_later_and_the_stop_at_the_end(
-    stuck: StuckDevice, connect: Connect
+    connect: Connect,
 ) -> None:
-    host = connect(stuck.path, boot_s=0.05)
-    assert until(host.is_ready)
-    assert fill(host) < 0.5
-    assert until(lambda: LineState.ABSENT in host.states, step=0.001)
-    assert len(stuck.seen()) < 5000
-    assert until(lambda: host.states.count(LineState.READY) == 2)
-    assert until(lambda: stuck.seen().endswith(b"\n" + STOP + STOP))
-    assert len(stuck.seen()) < 5000
-    host.line.drive(drive_line(0.4, 0.4))
-    assert until(lambda: stuck.seen().endswith(STOP + drive_line(0.4, 0.4)))
-    count = len(stuck.seen())
-    fill(host)
-    before = time.monotonic()
-    host.line.close()
-    assert time.monotonic() - before < 2.0
-    assert host.line.state is LineState.CLOSED
-    assert stuck.seen().endswith(b"\n" + STOP)
-    assert len(stuck.seen()) < count + 5000
+    with closing(StuckDevice()) as stuck:
+        host = connect(stuck.path, boot_s=0.05)
+        assert until(host.is_ready)
+        assert fill(host) < 0.5
+        assert until(lambda: LineState.ABSENT in host.states, step=0.001)
+        assert len(stuck.seen()) < 5000
+        assert until(lambda: host.states.count(LineState.READY) == 2)
+        assert until(lambda: stuck.seen().endswith(b"\n" + STOP + STOP))
+        assert len(stuck.seen()) < 5000
+        host.line.drive(drive_line(0.4, 0.4))
+        assert until(lambda: stuck.seen().endswith(STOP + drive_line(0.4, 0.4)))
+        count = len(stuck.seen())
+        fill(host)
+        before = time.monotonic()
+        host.line.close()
+        assert time.monotonic() - before < 2.0
+        assert host.line.state is LineState.CLOSED
+        assert stuck.seen().endswith(b"\n" + STOP)
+        assert len(stuck.seen()) < count + 5000

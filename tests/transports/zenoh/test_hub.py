@@ -5,8 +5,11 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -17,7 +20,7 @@ from pebble.errors import TransportError
 from pebble.extensions.media.frames import FrameReader, FrameWriter
 from pebble.transports import QoS, ZenohSettings, create
 from pebble.transports.peers import PeerRegistry, prepare_run_dir
-from pebble.transports.zenoh import wire
+from pebble.transports.zenoh import callbacks, wire
 from pebble.transports.zenoh.callbacks import direct
 from pebble.transports.zenoh.hub import ZenohHub
 from pebble.transports.zenoh.hub import journal as journal_module
@@ -30,6 +33,7 @@ from pebble.transports.zenoh.session import close_session, open_session, session
 from pebble.transports.zenoh.wire import Hello, Stamp, Will, digest
 from tests.small_disk import SmallDisk
 from tests.support import Clock, needs_root, refused, until
+from tests.transports.zenoh_net import HubProcess
 
 WILL = Will("status", b"gone", QoS.DELIVERED, True)
 
@@ -69,18 +73,11 @@ def test_a_client_is_asked_for_what_is_missing_or_its_own_and_changed(
     assert made.lacks(Hello("me", 5, None, own)) == lacking
 
 
-@pytest.fixture
-def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Room for 100 bytes."""
-    monkeypatch.setattr(hub_store, "MAX_BYTES", 100)
-    monkeypatch.setattr(hub_store, "OVERHEAD", 0)
-    monkeypatch.setattr(hub_store, "MAX_WILLS", 1)
-
-
-@pytest.mark.usefixtures("small")
 def test_what_has_no_room_is_refused_and_leaves_the_others_and_its_own_older_value(
-    caplog: pytest.LogCaptureFixture,
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    for limit, value in (("MAX_BYTES", 100), ("OVERHEAD", 0), ("MAX_WILLS", 1)):
+        monkeypatch.setattr(hub_store, limit, value)
     made = store(retained("a", bytes(90)), retained("b", bytes(20)), retained("a", bytes(95)))
     assert [len(record.payload) for record in made.retained()] == [95]
     assert not made.apply(retained("a", bytes(100)))
@@ -353,3 +350,85 @@ def test_a_full_disk_keeps_no_process_from_being_there(tmp_path: Path, monkeypat
     assert registry.ready() == {lock.name: "?"}
     lock.release()
     assert list(tmp_path.iterdir()) == []
+
+
+#: Answers with more than the sockets hold: from its handler, or from a thread for which its handler waits meanwhile.
+ANSWERING = """
+import sys, threading
+from pathlib import Path
+from pebble.transports import QoS, ZenohSettings, create
+
+def answer():
+    for _ in range(int(sys.argv[2])):
+        transport.publish("answer", bytes(int(sys.argv[3])), qos=QoS.DELIVERED)
+
+def answer_alone():
+    with lock:
+        begun.set()
+        answer()
+
+def on_request(message):
+    if message.payload == b"handler":
+        answer()
+    elif message.payload == b"thread":
+        threading.Thread(target=answer_alone).start()
+        begun.wait()
+    elif message.payload == b"lock":
+        lock.acquire()
+        lock.release()
+
+lock, begun = threading.Lock(), threading.Event()
+with create("zenoh", "answering", ZenohSettings(run_dir=Path(sys.argv[1]))) as transport:
+    transport.subscribe("request", on_request, direct=True)
+    print(flush=True)
+    sys.stdin.read()
+"""
+ANSWERS, ANSWER_BYTES = 3000, 1000
+
+
+@contextmanager
+def answering(hub: HubProcess) -> Iterator[None]:
+    """A process that is ready to answer."""
+    command = [sys.executable, "-c", ANSWERING, str(hub.settings.run_dir), str(ANSWERS), str(ANSWER_BYTES)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        process.stdout.readline()
+        yield
+        process.stdin.close()
+
+
+@pytest.fixture
+def hub(tmp_path: Path) -> Iterator[HubProcess]:
+    hub = HubProcess(tmp_path).start()
+    yield hub
+    hub.end()
+
+
+@pytest.mark.parametrize("requests", [[b"handler"], [b"thread", b"lock"]], ids=lambda one: one[0].decode())
+def test_a_handler_may_wait_for_what_is_published(hub: HubProcess, requests: list[bytes]) -> None:
+    """Its thread may be the one that waits for the sockets: the guard has another one do that."""
+    received: list[int] = []
+    with create("zenoh", "asking", hub.settings) as transport, answering(hub):
+        # It keeps no message: thousands of them would make Python's collector look at all that pytest has, which on a
+        # busy machine takes the 0.3 s after which a sender gives up (measured).
+        transport.subscribe("answer", lambda message: received.append(len(message.payload)), direct=True)
+        for number in range(1, 4):
+            for request in requests:
+                assert transport.publish("request", request, qos=QoS.DELIVERED)
+            assert until(lambda enough=number * ANSWERS: len(received) >= enough, 10), len(received)  # type: ignore[misc]
+    assert len(received) == 3 * ANSWERS
+
+
+def test_the_guard_rests_without_callbacks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(callbacks, "_LOOK_S", 0.001)
+    guard, calls = callbacks.Guard(), callbacks.Calls()
+    guard.watch(calls)
+    for _ in range(2):
+        calls.begun += 1
+        guard.wake()
+        assert until(lambda: guard.helped > 0, 5)  # it runs
+        assert not guard.rests
+        calls.ended += 1
+        assert until(lambda: guard.rests, 5)
+        guard.helped = 0

@@ -226,15 +226,11 @@ def test_retained_state_missed_while_one_connection_was_down_comes_with_it(robot
     sender.publish("state", b"old", qos=DELIVERED, retain=True)
     assert until(lambda: stalled.heard() == [1, "old"])
     stop(stalled)
-    while _links(sender) > 1:
+    while len(sender.session.info.links()) > 1:
         sender.publish("flood", bytes(100_000), qos=DELIVERED)
     sender.publish("state", b"new", qos=DELIVERED, retain=True)
     resume(stalled)
     assert until(lambda: stalled.heard()[1] == "new")
-
-
-def _links(transport: Any) -> int:
-    return len(transport.session.info.links())
 
 
 def test_a_will_survives_a_hub_without_a_journal(robot: ZenohNet) -> None:

@@ -25,7 +25,7 @@ from pebble.services.av_daemon.service import Reports
 from pebble.services.av_daemon.source import Capture, Source
 from pebble.services.av_daemon.stream import Stream
 from pebble.transports import QoS
-from tests.ext.av.av_daemon.av_rig import Remembering, is_speech, options
+from tests.ext.av.media_rig import Remembering, is_speech, options
 from tests.fakes.installed import Installed
 from tests.kit.robot import ProgramRobot
 from tests.kit.scene import read_counter
@@ -113,10 +113,6 @@ def synthetic() -> Callable[[], Source]:
     return sources.camera(options(video={**SMALL, "backend": "synthetic"}), time.monotonic())
 
 
-def numbers_of(writer: Remembering) -> list[int | None]:
-    return [read_counter(picture(data, info)) for info, data in writer.frames]
-
-
 def rests(stream: Stream) -> bool:
     return until(lambda: report(stream).doing == "rests: nobody reads")
 
@@ -158,7 +154,7 @@ def test_frames_are_born_in_the_segment_where_that_is_possible_and_stamped(strea
     writer = Remembering(born=born)
     stream = streams(writer, synthetic())
     assert until(lambda: len(writer.frames) >= 5)
-    numbers = numbers_of(writer)[:5]
+    numbers = [read_counter(picture(data, info)) for info, data in writer.frames[:5]]
     assert None not in numbers
     assert numbers == sorted(set(numbers))
     assert (writer.counters["born"] >= 5) is born

@@ -35,7 +35,7 @@ from pebble.services.av_daemon.source import Capture, Source
 from pebble.services.av_daemon.sources import Rotated
 from pebble.services.av_daemon.synthetic import Pacer, SyntheticCamera, SyntheticMicrophone
 from pebble.services.av_daemon.v4l2 import V4l2Camera
-from tests.ext.av.av_daemon.av_rig import grabbed, options
+from tests.ext.av.media_rig import grabbed, options
 from tests.ext.lab.simulation.world.worlds import CLEAR, projected, tags_in
 from tests.fakes.installed import Installed
 from tests.kit.scene import read_counter

@@ -1,4 +1,4 @@
-"""Processes that write or read frames: `python -m tests.ext.media.frames.frames_peer ROLE FOLDER JSON`.
+"""Processes that write or read frames.
 
 Each says `up` when it is ready, answers a line on stdin with what it knows as a line of JSON, and ends with stdin.
 """
@@ -33,13 +33,12 @@ class Options(msgspec.Struct, kw_only=True):
     user: int | None = None  # become this user, which takes root
 
 
-def main(role: str, folder: str, options: str) -> None:
-    chosen = msgspec.json.decode(options, type=Options)
+def main(role: str, folder: Path, chosen: Options) -> None:
     if chosen.memlock is not None:
         resource.setrlimit(resource.RLIMIT_MEMLOCK, (chosen.memlock, chosen.memlock))
     if chosen.user not in (None, os.geteuid()):
         become(chosen.user)
-    peer = {"writer": Writer, "reader": Reader}[role](Path(folder), chosen)
+    peer = {"writer": Writer, "reader": Reader}[role](folder, chosen)
     worker = threading.Thread(target=peer.run, daemon=True)
     worker.start()
     report("up")
@@ -137,7 +136,3 @@ class Reader:
 
     def stop(self) -> None:
         self._reader.close()
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])

@@ -13,7 +13,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -32,17 +31,14 @@ from tests.transports.forked import Forked
 
 SMALL = 160 * 120 * 3  # to be shared all the same
 QVGA = 320 * 240 * 3  # a pool of these fits into the 8 MiB that users may usually lock
-UNPRIVILEGED_USER = (
-    65534 if os.geteuid() == 0 else os.geteuid()
-)  # root may lock what it likes; for others the limits count
+UNPRIVILEGED_USER = os.geteuid() or 65534  # root may lock what it likes; for others the limits count
 
 
 class Peer:
     """One process; `ask` for its numbers."""
 
     def __init__(self, role: str, folder: Path, options: Options) -> None:
-        arguments = (role, str(folder), msgspec.json.encode(options).decode())
-        self._process = Forked("tests.ext.media.frames.frames_peer", *arguments)
+        self._process = Forked("tests.ext.media.frames.frames_peer", role, folder, options)
         assert self._line() == "up"
 
     def ask(self) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -81,14 +82,14 @@ def test_an_array_keeps_its_memory() -> None:
     assert pool.alloc(600_000)
 
 
-def _unprintable(buffer: object) -> int:
-    raise views.UnexpectedLayoutError("ZShmMut does not print its address")
-
-
 MISMATCHES = {
     "another version": ("KNOWN_VERSIONS", frozenset({"1.9.0"}), "1.9.0"),
     "the address is nowhere": ("_printed", lambda _: 1, "none of its words"),
-    "nothing is printed": ("_printed", _unprintable, "does not print"),
+    "nothing is printed": (
+        "_printed",
+        Mock(side_effect=views.UnexpectedLayoutError("ZShmMut does not print")),
+        "does not print",
+    ),
     "it is a word further": ("_only", lambda found: min(found[0]) + 8, "has moved"),
     "buffers are smaller": ("_only", lambda _: 4096, "too small"),
 }
@@ -311,28 +312,24 @@ def env() -> Iterator[dict[str, str]]:
         yield {"TMPDIR": folder}
 
 
-@pytest.fixture
-def filming(env: dict[str, str]) -> Iterator[Filming]:
-    with Filming(default_run_folder("pebble/robots/goob", env)) as filming:
-        yield filming
-
-
 @needs_shared_memory
 def test_pictures_of_a_robot_by_its_id_its_base_topic_its_run_directory_and_its_config(
-    filming: Filming, env: dict[str, str], tmp_path: Path
+    env: dict[str, str], tmp_path: Path
 ) -> None:
     config = tmp_path / "goob.json"
     config.write_text(json.dumps({"robot": {"id": "goob"}}))
-    for robot in ("goob", "pebble/robots/goob", default_run_folder("pebble/robots/goob", env), config, str(config)):
-        with camera(robot, env=env, timeout=5) as pictures:
-            picture = next(pictures)
-            assert (picture.shape, picture[5, 5].tolist()) == ((240, 320, 3), [10, 20, 30])
-            picture[:] = 0  # it is ours
-    with camera("goob", env=env, views=True, timeout=5) as pictures:
-        assert not next(pictures).flags.writeable, "it is the camera's own memory"
-        assert pictures.frame is not None
-        assert pictures.frame.valid()
-        assert pictures.frame.info.captured_ns > 0
+    run_dir = default_run_folder("pebble/robots/goob", env)
+    with Filming(run_dir):
+        for robot in ("goob", "pebble/robots/goob", run_dir, config, str(config)):
+            with camera(robot, env=env, timeout=5) as pictures:
+                picture = next(pictures)
+                assert (picture.shape, picture[5, 5].tolist()) == ((240, 320, 3), [10, 20, 30])
+                picture[:] = 0  # it is ours
+        with camera("goob", env=env, views=True, timeout=5) as pictures:
+            assert not next(pictures).flags.writeable, "it is the camera's own memory"
+            assert pictures.frame is not None
+            assert pictures.frame.valid()
+            assert pictures.frame.info.captured_ns > 0
 
 
 def test_no_such_robot_is_one_clear_sentence(env: dict[str, str]) -> None:

@@ -390,13 +390,3 @@ def test_a_start_waits_until_its_script_is_listed_unless_something_comes_first(
         assert len(bench.children.all) == bool(status.get("running"))
     finally:
         bench.close()
-
-
-# -- its own end
-
-
-def test_its_end_ends_everything_and_is_published(bench: Bench) -> None:
-    bench.start("follow")
-    bench.running.stop()
-    assert {tuple(child.signals) for child in bench.children.all} == {(TERM, KILL)}
-    assert bench.becomes(**IDLE)

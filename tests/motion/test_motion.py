@@ -1,9 +1,9 @@
-"""Repeats what the cores did in histories, call by call, in the real MicroPython."""
+"""Histories against latch and arbiter in CPython, and what the cores did, call by call, in the real MicroPython."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,8 +11,11 @@ from typing import Any
 from pebble.extensions.install.flash.boards import FIRMWARE
 from pebble.motion.latch import is_name, reset_of, stop_of
 from tests.firmware.micropython import SCRIPTS, compile_module, run
-from tests.motion.histories import ENGINE
+from tests.motion.histories import ENGINE, LENGTH
 from tests.motion.world import CORE_NAMES, CORES, World
+from tests.support import cases
+
+HISTORIES, REPEATED = cases(80_000, 300_000) // LENGTH, 100
 
 _BODIES: tuple[Any, ...] = (
     *(None, 0, True, "stop", [], [1], {}, {"stop": None}, {"stop": 7}, {"stop": "0" * 15}, {"stop": "0" * 17}),
@@ -108,15 +111,21 @@ def _recording(calls: list[Any]) -> Any:
     return SimpleNamespace(Latch=Latch, Lease=Lease, Arbiter=Arbiter, diff=CORES.diff, StopSender=CORES.StopSender)
 
 
-def repeat(folder: Path, lines: Iterable[str]) -> list[str]:
-    """Repeat the calls in MicroPython, on the cores as they are compiled for a board; the lines that it prints.
+def test_no_history_breaks_a_rule() -> None:
+    broken = [one for one in ENGINE.run("", 0, range(HISTORIES)) if one.problems]
+    assert not broken, "python -m tests.kit.schedules motion --seed 0 prints the shortest history"
 
-    The last one is ``[histories, calls, whether all results are the same]``.
-    """
+
+def test_micropython_returns_the_same_results(tmp_path: Path) -> None:
+    """The calls are repeated on the cores as they are compiled for a board; how many, and whether all results are the
+    same, is the last line."""
     for name in CORE_NAMES:
-        compile_module(FIRMWARE["minilamp"], Path("common", f"{name}.py"), folder)
-    with (folder / "traces.jsonl").open("w", encoding="utf-8") as file:
-        file.writelines(line + "\n" for line in (bodies(), *lines))
-    done = run(folder, SCRIPTS / "motion.py", heap=8 * 1024 * 1024, timeout_s=600.0)
+        compile_module(FIRMWARE["minilamp"], Path("common", f"{name}.py"), tmp_path)
+    lines = (bodies(), *traces(0, REPEATED))
+    (tmp_path / "traces.jsonl").write_text("".join(line + "\n" for line in lines), encoding="utf-8")
+    done = run(tmp_path, SCRIPTS / "motion.py", heap=8 * 1024 * 1024, timeout_s=600.0)
     assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout.splitlines()
+    [counts] = done.stdout.splitlines()
+    histories, calls, same = json.loads(counts)
+    assert (histories, same) == (REPEATED, True)
+    assert calls > 50 * REPEATED
