@@ -35,7 +35,7 @@ demo:
 # Types and lint use what tests leave of the processors. Several hundred tests start whole robots and check deadlines on two
 # processors: one of them may miss its own, so what failed runs a second time.
 QUICKLY := --workers 4 -m "not page and not thorough and not alone" tests/contract tests/forwarding tests/motion \
-	tests/robot/test_two_owners.py tests/transports/test_contract.py
+	tests/robot/test_lockstep.py tests/transports/test_contract.py
 WHOLE := --workers 8 --durations 10 -m "not page$(if $(THOROUGH),, and not thorough)" --ignore tests/ext/install/life tests
 test: .venv/.ready-dev
 	@$(DEBIAN) mosquitto=mosquitto mosquitto_pub=mosquitto-clients chromium=chromium g++=g++ openssl=openssl \
