@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -56,6 +57,8 @@ def test_refused_while_it_runs(make: Callable[..., Action], tmp_path: Path) -> N
     action = make(*PYTHON, f"import os\nwhile not os.path.exists({str(gate)!r}): pass")
     assert action.request()
     assert not action.request()
+    follows = [thread.daemon for thread in threading.enumerate() if thread.name == f"action {action.name}"]
+    assert follows == [True], "a bridge ends before the command that restarts it does"
     gate.touch()
     assert until(lambda: not action.running)
     assert finished(action)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from pebble.config import load
-from pebble.services.mqtt_bridge.requests.earlier_names import EarlierNames
+from pebble.services.mqtt_bridge.requests.earlier_names import CallIn, EarlierNames
 from pebble.transports import Transport
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.services.mqtt_bridge.bridge_rig import Client, MemoryRig
@@ -120,10 +121,13 @@ def test_a_damaged_file_removes_nothing(robot: Named, text: str) -> None:
 def test_a_bridge_looks_for_them_once_it_forwards(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    begun: list[EarlierNames] = []
-    monkeypatch.setattr(EarlierNames, "begin", lambda names: begun.append(names))
+    begun, later = list[float](), list[CallIn]()
+    jobs = [(wait_s, partial(begun.append, wait_s)) for wait_s in (60.0, 0.0)]
+    monkeypatch.setattr(EarlierNames, "__init__", lambda _names, _config, _sides, call_in: later.append(call_in))
+    monkeypatch.setattr(EarlierNames, "begin", lambda _names: begun or [later[0](*job) for job in jobs])
     rig = MemoryRig(monkeypatch)
     rig.bridge()
     assert until(lambda: begun, 5)
+    assert begun[0] == 0.0, "what is to be done in a minute waits"
     rig.close()
     assert "failed at the bridge" not in caplog.text
