@@ -417,6 +417,14 @@ def test_a_second_hub_is_refused(robot: ZenohNet) -> None:
     assert robot.client("client").state is State.CONNECTED
 
 
+def test_a_hub_that_meets_another_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    endpoint = f"tcp/localhost:{free_port()}#iface=lo"
+    first = ZenohSettings(run_dir=tmp_path / "first", listen=(endpoint,))
+    second = ZenohSettings(run_dir=tmp_path / "second", connect=(endpoint,))
+    with contextlib.closing(ZenohHub(first).open()), contextlib.closing(ZenohHub(second).open()):
+        assert until(lambda: "another hub is connected to this one" in caplog.text)
+
+
 def test_nonsense_does_not_disturb_the_hub(robot: ZenohNet) -> None:
     client = robot.client("client")
     session: zenoh.Session = client.session  # type: ignore[attr-defined]
