@@ -40,7 +40,9 @@ def test_children_start_in_order_and_stop_one_stage_after_the_other_and_nothing_
     assert message["payload"]["schema"] == "pebble-capabilities/v1"
     assert message["payload"]["value"]["transport"] == {"kind": "mqtt"}
     assert (message["qos"], message["retain"]) == (1, True)
+    began = time.monotonic()
     assert robot.stop() == 0
+    assert time.monotonic() - began < 2.0, "it waits for nothing that has ended"
     stopped = [line.split()[0] for line in lines_of(robot.journal) if line.split()[1] == "stop"]
     assert stopped == ["bridge", "serial", "hub"]
     assert all(gone(pid) for pid in pids)

@@ -177,9 +177,10 @@ def test_the_watchdog_is_served_at_half_its_time(environment: dict[str, str], pe
 def test_the_folder_is_for_this_user_alone(tmp_path: Path, mode: int | None) -> None:
     run = tmp_path / "a" / "b"
     if mode is not None:
-        run.mkdir(mode, parents=True)
+        run.parent.mkdir(0o700)
+        run.mkdir(mode)
     with RunLock(run, "x/y/z", tmp_path / "state.lock") as lock:
-        assert run.stat().st_mode & 0o777 == 0o700
+        assert [folder.stat().st_mode & 0o777 for folder in (run, run.parent)] == [0o700] * 2
         assert lock.path.read_text() == f"{os.getpid()}\nx/y/z\n"
 
 

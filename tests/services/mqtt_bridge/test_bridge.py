@@ -193,6 +193,8 @@ class TestHeartbeat:
         rig.remote.transport.subscribe(f"{BASE}/outgoing/online", press)
         rig.bridge()
         assert until(lambda: PRESS in rig.local.payloads(STOP), 3)
+        rig.close()
+        assert b'"online":false' in rig.remote_hub.retained[f"{BASE}/outgoing/online"].payload
 
 
 class TestUrgency:

@@ -428,6 +428,7 @@ def test_the_guard_rests_without_callbacks(monkeypatch: pytest.MonkeyPatch) -> N
         calls.begun += 1
         guard.wake()
         assert until(lambda: guard.helped > 0, 5)  # it runs
+        assert guard.helped < 500, "it pauses between two looks"
         assert not guard.rests
         calls.ended += 1
         assert until(lambda: guard.rests, 5)

@@ -26,7 +26,7 @@ from pebble.errors import TransportError
 from pebble.extensions.lab.bench.usage import pss_mb
 from pebble.transports import Message, QoS, State, TlsSettings, ZenohSettings, create
 from pebble.transports.zenoh import publishers, wire
-from pebble.transports.zenoh.hub import ZenohHub
+from pebble.transports.zenoh.hub import ZenohHub, wills
 from tests.support import ROOT, free_port, until
 from tests.transports.forked import Forked
 from tests.transports.net import Received
@@ -411,6 +411,25 @@ def test_a_second_hub_is_refused(robot: ZenohNet) -> None:
     assert second.wait(20) == 1
     assert "there is a hub for " in second.printed
     assert robot.client("client").state is State.CONNECTED
+
+
+def test_a_hub_that_meets_another_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    endpoint = f"tcp/localhost:{free_port()}#iface=lo"
+    first = ZenohSettings(run_dir=tmp_path / "first", listen=(endpoint,))
+    second = ZenohSettings(run_dir=tmp_path / "second", connect=(endpoint,))
+    with contextlib.closing(ZenohHub(first).open()), contextlib.closing(ZenohHub(second).open()):
+        assert until(lambda: "another hub is connected to this one" in caplog.text)
+
+
+def test_a_hello_of_a_client_that_is_gone_leaves_a_will(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(wills, "RETURN_S", 0.1)
+    settings = ZenohSettings(run_dir=tmp_path / "run")
+    hello = wire.Hello("gone", 0, wire.Will("status", b"gone", DELIVERED, True), {})
+    with contextlib.closing(ZenohHub(settings).open()) as hub, create("zenoh", "client", settings) as client:
+        session: zenoh.Session = client.session  # type: ignore[attr-defined]
+        session.liveliness().declare_token(wire.LIVE + "gone").undeclare()
+        assert wire.ask(session, wire.HELLO, wire.encode(hello), 5.0) is not None
+        assert until(lambda: hub.retained == {"status": b"gone"})
 
 
 def test_nonsense_does_not_disturb_the_hub(robot: ZenohNet) -> None:
