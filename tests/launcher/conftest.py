@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from tests.launcher.robot import Launch, Robot, Row
+from tests.support import WAIT_S
 
 
 @pytest.fixture
@@ -20,6 +21,6 @@ def launch(tmp_path: Path) -> Iterator[Launch]:
     yield make
     for robot in robots:
         robot.process.kill()  # the children notice by themselves
-        robot.process.wait(10)
+        robot.process.wait(WAIT_S)
         left = robot.end_leftovers()
         assert not left, f"processes that outlived their launcher: {left}"

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pebble.extension import Stage
-from tests.support import ROOT, gone, process_name, until
+from tests.support import ROOT, WAIT_S, gone, process_name, until
 
 BASE = "pebble/robots/rover"
 FAKES = ROOT / "tests" / "fakes"
@@ -50,7 +50,7 @@ class Robot:
 
     def stop(self) -> int:
         self.process.send_signal(signal.SIGTERM)
-        return self.process.wait(20)
+        return self.process.wait(WAIT_S)
 
     def order(self, asker: str, *orders: str) -> None:
         """Have an ``asker`` that is ready request a program: ``media 1``."""
@@ -90,7 +90,7 @@ class Robot:
         return statuses[-1]["payload"]["value"]["services"] if statuses else {}
 
     def ready(self, *names: str) -> bool:
-        return until(lambda: all(self.states().get(name) == "ready" for name in names), 20)
+        return until(lambda: all(self.states().get(name) == "ready" for name in names))
 
     def logs(self) -> list[Any]:
         return [line["payload"] for line in self.published("logs")]

@@ -32,7 +32,7 @@ def retain_messages(port: int, messages: dict[str, Any]) -> None:
     publisher = Operator(port, BASE)
     for topic, body in messages.items():
         publisher.send(topic, body, retain=True)
-    assert until(lambda: set(retained_messages(port, BASE, 0.2)) >= set(messages), 5)
+    assert until(lambda: set(retained_messages(port, BASE, 0.2)) >= set(messages))
     publisher.close()
 
 
@@ -58,9 +58,9 @@ def test_what_is_retained_does_nothing_and_a_live_stop_that_asks_to_be_retained_
     if rig.local is not None:
         assert not set(retained_messages(rig.local.port, BASE)) & set(COMMANDS)
     began = time.monotonic()
-    assert until(lambda: _turns(rig, began), 5)
+    assert until(lambda: _turns(rig, began))
     assert not any(seen.json["latched"] or seen.json["count"] for seen in rig.operator.on(state))
-    assert until(lambda: _is_stopped(rig, state), 5, step=0.2)
+    assert until(lambda: _is_stopped(rig, state), step=0.2)
     stopped = time.monotonic()
     assert not until(lambda: _turns(rig, stopped), 1)
 

@@ -11,7 +11,7 @@ import pytest
 from tests.robot.conftest import Station
 from tests.robot.operator import retained_messages
 from tests.robot.rig import BASE, STOP
-from tests.support import until
+from tests.support import SOON_S, until
 
 pytestmark = pytest.mark.alone  # deadlines are checked
 
@@ -25,11 +25,7 @@ def stop_and_wait(station: Station) -> None:
     def stands() -> bool:
         return station.rig.mcu.drives(began) and not station.rig.mcu.moving()
 
-    for _ in range(4):
-        station.operator.send(DRIVE, {"x": 0, "z": 0})
-        if until(stands, 1):
-            return
-    assert stands()
+    assert until(lambda: station.operator.send(DRIVE, {"x": 0, "z": 0}) and until(stands, 1))
 
 
 def first_motion(station: Station, since: float) -> tuple[float, tuple[float, float]]:
@@ -48,7 +44,7 @@ def test_drive_forms_reach_the_wheels(station: Station, body: Any, wheels: tuple
     stop_and_wait(station)
     began = time.monotonic()
     station.operator.send(DRIVE, body)
-    assert until(lambda: station.rig.mcu.moving(began), 3)
+    assert until(lambda: station.rig.mcu.moving(began))
     assert first_motion(station, began)[1] == pytest.approx(wheels)
 
 
@@ -56,11 +52,11 @@ def test_silence_stops_the_wheels(station: Station) -> None:
     stop_and_wait(station)
     began = time.monotonic()
     station.operator.send(DRIVE, {"x": 0.1, "z": 0.3})
-    assert until(lambda: station.rig.mcu.moving(began), 3)
-    assert until(lambda: not station.rig.mcu.moving(began), 3)
+    assert until(lambda: station.rig.mcu.moving(began))
+    assert until(lambda: not station.rig.mcu.moving(began))
     started, _ = first_motion(station, began)
     stopped, _ = next((at, wheels) for at, wheels in station.rig.mcu.drives(started) if wheels == STOP)
-    assert 0.70 <= stopped - started <= 0.85
+    assert 0.70 <= stopped - started < 1.0, "later the MCU stops by itself"
 
 
 def test_actions_run_once_and_only_for_true(station: Station) -> None:
@@ -70,7 +66,7 @@ def test_actions_run_once_and_only_for_true(station: Station) -> None:
     station.operator.send("incoming/flags/reboot", True, retain=True)
     station.operator.send("incoming/flags/reboot", b"", retain=True)
     station.operator.send("incoming/flags/service-restart", {"enabled": True})
-    assert until(lambda: len(station.rig.recorded()) > before, 3)
+    assert until(lambda: len(station.rig.recorded()) > before)
     assert station.rig.recorded()[before:] == ["service_restart"]
 
 
@@ -79,9 +75,9 @@ def test_actions_run_once_and_only_for_true(station: Station) -> None:
 
 def test_four_heartbeats_a_second(uplinked: Station) -> None:
     began = time.monotonic()
-    assert until(lambda: len(uplinked.operator.on("outgoing/online", began)) >= 9, 5)
+    assert until(lambda: len(uplinked.operator.on("outgoing/online", began)) >= 9)
     heartbeats = uplinked.operator.on("outgoing/online", began)[:9]
-    assert 1.5 <= heartbeats[-1].at - heartbeats[0].at <= 3.0
+    assert 1.5 <= heartbeats[-1].at - heartbeats[0].at < SOON_S
     assert abs(heartbeats[-1].json["t"] / 1000 - time.time()) < 3
     assert "outgoing/online" in retained_messages(uplinked.rig.remote.port, BASE)
 
@@ -98,10 +94,10 @@ def test_stopping_the_robot_stops_the_wheels_and_reports_offline(uplinked: Stati
     rig = uplinked.rig
     began = time.monotonic()
     uplinked.operator.send(DRIVE, {"x": 0, "z": 0.5})
-    assert until(lambda: rig.mcu.moving(began), 3)
+    assert until(lambda: rig.mcu.moving(began))
     left_behind = rig.processes()
     assert rig.stop() == 0
     assert rig.mcu.drives(began)[-1][1] == STOP
-    assert until(lambda: (last := uplinked.operator.last("outgoing/online")) and last.json.get("online") is False, 3)
+    assert until(lambda: (last := uplinked.operator.last("outgoing/online")) and last.json.get("online") is False)
     assert not [pid for pid in left_behind.values() if rig.alive(pid)]
     rig.start()

@@ -147,7 +147,7 @@ class World:
             self.people = [opened.enter_context(closing(person)) for person in people]
             local = (self.rig.local or self.rig.remote).port
             self.watcher = opened.enter_context(closing(Operator(local, BASE, "outgoing/+/serial")))
-            assert until(lambda: self.watcher.last(STATE) is not None, 15), "nothing is mirrored"
+            assert until(lambda: self.watcher.last(STATE) is not None), "nothing is mirrored"
             self.alive = opened.enter_context(closing(Alive(self.rig.folder)))
             self._stalls = opened.enter_context(closing(Stalls()))
             self._timers: list[threading.Timer] = []

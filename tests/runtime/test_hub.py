@@ -23,7 +23,7 @@ from pebble.transports.zenoh.hub.intake import ASKED_BYTES, QUEUE_BYTES, SENDERS
 from pebble.transports.zenoh.hub.journal import Journal
 from pebble.transports.zenoh.hub.records import StoredWill
 from pebble.transports.zenoh.wire import Will
-from tests.support import ROOT, Child, until
+from tests.support import ROOT, WAIT_S, Child, until
 from tests.transports.zenoh_net import HubProcess
 
 BASE = "pebble/robots/goob"
@@ -71,7 +71,7 @@ def die(settings: ZenohSettings, *topics: str) -> None:
     assert victim.stdout is not None
     assert victim.stdout.readline().count("CONNECTED") == len(topics), "a hello succeeds, whatever the will"
     victim.kill()
-    victim.wait(10)
+    victim.wait(WAIT_S)
     victim.stdout.close()
 
 

@@ -11,7 +11,7 @@ import pytest
 from pebble.runtime.inbox import Inbox
 from pebble.runtime.timers import Timers
 from pebble.runtime.work_lock import WorkLock
-from tests.support import cases, until
+from tests.support import WAIT_S, cases, until
 
 
 def drain(inbox: Inbox) -> None:
@@ -158,7 +158,7 @@ def test_no_other_thread_enters_before_the_own_one_that_waits() -> None:
 
     def work() -> None:
         with lock:
-            ends.wait(10)
+            ends.wait(WAIT_S)
 
     assert lock.try_enter()
     own = threading.Thread(target=work, daemon=True)
@@ -169,7 +169,7 @@ def test_no_other_thread_enters_before_the_own_one_that_waits() -> None:
         assert not any(lock.try_enter() for _ in range(1000))
     finally:
         ends.set()
-        own.join(10)
+        own.join(WAIT_S)
     assert lock.try_enter()
 
 

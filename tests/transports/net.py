@@ -13,7 +13,7 @@ from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
 from pebble.transports import Message, QoS, State, Transport, create
-from tests.support import until
+from tests.support import WAIT_S, until
 from tests.transports.forked import Forked
 
 
@@ -100,7 +100,7 @@ class Net(ABC):
         client = create(self.kind, name, settings, will=will)
         self._clients.append(client)
         if opened:
-            client.open(10)
+            client.open(WAIT_S)
             assert client.state is State.CONNECTED, client.problem
         return client
 
@@ -127,12 +127,12 @@ class ProcessPeer:
 
     def kill(self) -> None:
         self._process.kill()
-        self._process.wait(10)
+        self._process.wait(WAIT_S)
         self._release()
 
     def close(self) -> None:
         self._ask({"close": True})
-        self._process.wait(10)
+        self._process.wait(WAIT_S)
         self._release()
 
     def _ask(self, request: dict[str, Any]) -> Any:
@@ -142,7 +142,7 @@ class ProcessPeer:
 
     def _answer(self) -> Any:
         line = self._process.stdout.readline()
-        assert line, f"the peer died with exit code {self._process.wait(10)}"
+        assert line, f"the peer died with exit code {self._process.wait(WAIT_S)}"
         return json.loads(line)
 
     def _release(self) -> None:
@@ -163,6 +163,6 @@ class Received:
     def payloads(self) -> list[bytes]:
         return [message.payload for message in self.messages]
 
-    def until(self, *payloads: bytes, timeout: float = 10.0) -> bool:
+    def until(self, *payloads: bytes, timeout: float = WAIT_S) -> bool:
         """Have exactly these payloads arrived, in this order?"""
         return until(lambda: self.payloads == list(payloads), timeout)

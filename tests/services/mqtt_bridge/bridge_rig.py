@@ -18,7 +18,7 @@ from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.transports import Message, QoS, State, Transport
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.kit.robot import Running as Running
-from tests.support import until
+from tests.support import WAIT_S, until
 
 BASE = "pebble/robots/rover"
 
@@ -57,7 +57,7 @@ class Client:
         self.transport, self.base = transport, base
         self.seen: list[Message] = []
         self.probes: list[Message] = []
-        transport.open(10)
+        transport.open(WAIT_S)
         assert transport.state is State.CONNECTED, transport.problem
         if listen:
             transport.subscribe(f"{base}/#", self._remember, echo=False, direct=True)

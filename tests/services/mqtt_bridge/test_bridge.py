@@ -13,7 +13,7 @@ from pebble.forwarding.routing import Side
 from pebble.transports import Message, QoS
 from pebble.transports.memory import MemoryTransport
 from tests.services.mqtt_bridge.bridge_rig import BASE, MemoryRig
-from tests.support import until
+from tests.support import WAIT_S, until
 
 STOP, STATE = "incoming/estop", "outgoing/estop/mcu"
 MIRROR_FLAG = "incoming/flags/remote-mirror"
@@ -38,7 +38,7 @@ class TestHeartbeat:
 
         rig.remote.transport.subscribe(f"{BASE}/outgoing/online", press)
         rig.bridge()
-        assert until(lambda: PRESS in rig.local.payloads(STOP), 3)
+        assert until(lambda: PRESS in rig.local.payloads(STOP))
 
 
 class TestUrgency:
@@ -69,14 +69,14 @@ class TestUrgency:
 
         def hold(_topic: str) -> bool:
             held.set()
-            return over.wait(10)
+            return over.wait(WAIT_S)
 
         holding = partial(bridge.forwarder.retained.remove, Side.REMOTE, f"{BASE}/{STATE}", unless=hold)
         threading.Thread(target=holding, daemon=True).start()
-        assert held.wait(5)
+        assert held.wait(WAIT_S)
         rig.remote.publish(STOP, PRESS, retain=retain)
         rig.remote.publish(MIRROR_FLAG, TRUE, retain=True)
-        assert until(lambda: rig.local.payloads(STOP) == [PRESS], 5)
+        assert until(lambda: rig.local.payloads(STOP) == [PRESS])
         assert not rig.local.on(MIRROR_FLAG)
         over.set()
         assert until(lambda: rig.local.on(MIRROR_FLAG))

@@ -124,6 +124,6 @@ def test_a_bridge_looks_for_them_once_it_forwards(
     monkeypatch.setattr(EarlierNames, "begin", lambda names: begun.append(names))
     rig = MemoryRig(monkeypatch)
     rig.bridge()
-    assert until(lambda: begun, 5)
+    assert until(lambda: begun)
     rig.close()
     assert "failed at the bridge" not in caplog.text

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from pebble.motors.state_file import StateFile, Unreadable
-from tests.support import until
+from tests.support import WAIT_S, until
 
 
 class Saved:
@@ -40,7 +40,7 @@ def test_only_the_newest_of_many_values_is_written_and_closing_waits_for_it(
     dumps, written = json.dumps, []
 
     def slowly(value: Any) -> str:
-        assert may_write.wait(5)
+        assert may_write.wait(WAIT_S)
         written.append(value)
         return dumps(value)
 

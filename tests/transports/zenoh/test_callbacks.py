@@ -81,7 +81,7 @@ def test_a_handler_may_wait_for_what_is_published(hub: HubProcess, requests: lis
         for number in range(1, 4):
             for request in requests:
                 assert transport.publish("request", request, qos=QoS.DELIVERED)
-            assert until(lambda enough=number * ANSWERS: len(received) >= enough, 10), len(received)  # type: ignore[misc]
+            assert until(lambda enough=number * ANSWERS: len(received) >= enough), len(received)  # type: ignore[misc]
     assert len(received) == 3 * ANSWERS
 
 
@@ -92,8 +92,8 @@ def test_the_guard_rests_without_callbacks(monkeypatch: pytest.MonkeyPatch) -> N
     for _ in range(2):
         calls.begun += 1
         guard.wake()
-        assert until(lambda: guard.helped > 0, 5)  # it runs
+        assert until(lambda: guard.helped > 0)  # it runs
         assert not guard.rests
         calls.ended += 1
-        assert until(lambda: guard.rests, 5)
+        assert until(lambda: guard.rests)
         guard.helped = 0
