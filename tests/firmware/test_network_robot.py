@@ -451,7 +451,8 @@ def test_nothing_hostile_moves_a_robot_or_stops_its_heartbeat(hall: Hall) -> Non
 
 
 @pytest.mark.parametrize("fault", ["black hole", "broker killed"])
-def test_motors_are_off_within_a_second_and_no_retained_command_moves_them_afterwards(hall: Hall, fault: str) -> None:
+def test_motors_stop_by_themselves_and_no_retained_command_moves_them_afterwards(hall: Hall, fault: str) -> None:
+    """After a second, which test_deadman_virtual measures."""
     begin, end = {
         "black hole": (hall.link.blackhole, hall.link.resume),
         "broker killed": (hall.broker.kill, hall.broker.start),

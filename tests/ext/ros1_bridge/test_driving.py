@@ -19,7 +19,7 @@ from pebble.services.ros1_bridge.messages import GOAL_ID, GOAL_STATUS, TWIST
 from pebble.services.ros1_bridge.node import Node
 from pebble.services.ros1_bridge.xmlrpc_api import call, serve
 from tests.ext.ros1_bridge.conftest import Husky, World
-from tests.support import SOON_S, WAIT_S, until
+from tests.support import WAIT_S, until
 
 TOPIC = "/cmd_vel"
 
@@ -43,7 +43,7 @@ def test_a_command_becomes_a_twist_and_ends_in_zeros_then_silence(
     assert husky.ros.moves(begin)[0][2] == ["0.600000", "-0.600000"]
     assert until(lambda: len(husky.ros.zeros(begin)) >= 5)
     first = (husky.ros.zeros(begin)[0][0] - last) / 1e9
-    assert 0.6 < first < SOON_S, "0.75 s after the last command, on a machine that is not busy"
+    assert 0.6 < first < 1.6, "0.75 s after the last command, on a machine that is not busy"
     time.sleep(0.6)
     assert husky.ros.moves(husky.ros.zeros(begin)[0][0]) == []
     assert len(husky.ros.zeros(begin)) <= 7
@@ -68,7 +68,7 @@ def test_its_sender_stops_the_base_although_the_service_hangs(ros: World) -> Non
         sender.drive(0.4, 0.0, 0.3)
         assert until(lambda: ros.zeros(begin) and ros.moves(begin))
         assert until(lambda: ros.zeros(ros.moves(begin)[-1][0]))
-        assert (ros.zeros(ros.moves(begin)[-1][0])[0][0] - begin) / 1e9 < SOON_S
+        assert (ros.zeros(ros.moves(begin)[-1][0])[0][0] - begin) / 1e9 < 1.0
         assert len(ros.moves(begin)) <= 6, "once, then every 0.05 s"
         begin = time.monotonic_ns()
         sender.drive(0.4, 0.0, 5.0)
