@@ -68,7 +68,7 @@ def rests(lamp: RecordingRobot) -> bool:
 def driving(console: Terminal, lamp: RecordingRobot, key: bytes = b"w") -> None:
     """Press ``key``, and again where a stall of a busy machine has ended the gesture."""
     moving = lambda: moves((lamp.drives() or [ZERO])[-1]) and "driving x" in console.shown
-    end = time.monotonic() + 20
+    end = time.monotonic() + WAIT_S
     while not moving():
         assert time.monotonic() < end, console.shown
         console.hold(b"")

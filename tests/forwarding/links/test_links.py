@@ -155,7 +155,7 @@ def test_stops_flags_and_commands_arrive_and_come_to_rest_without_bridge_mode(ma
         rig.remote.publish(AUDIO_FLAG, other, retain=True)
         time.sleep(1 / len(flags))
     rig.remote.publish("incoming/flags/git-pull", b"true")
-    Quiet(rig.local, rig.remote).wait(1.0, 20)
+    Quiet(rig.local, rig.remote).wait(1.0)
     assert rig.local.payloads(STOP) == [PRESS]
     assert STOP not in rig.retained(LOCAL)
     assert len(rig.local.on(DRIVE)) == 50

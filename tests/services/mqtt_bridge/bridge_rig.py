@@ -128,7 +128,7 @@ class Quiet:
     def __init__(self, *clients: Client) -> None:
         self._clients = clients
 
-    def wait(self, seconds: float = 0.3, timeout: float = 10.0) -> None:
+    def wait(self, seconds: float = 0.3, timeout: float = WAIT_S) -> None:
         """Until no client has seen anything but heartbeats for ``seconds``: a loop never lets it return."""
         end = time.monotonic() + timeout
         before, since = self._count(), time.monotonic()
