@@ -112,5 +112,5 @@ def test_at_a_fleets_broker_it_has_an_account_of_its_own(
                 lambda: f"{BASE}/outgoing/wheel-odometry" in seen and b'"short":"~/goob"' in b"".join(said), 0.3
             )
 
-        assert until(arrives, 20 if comes else 1) is comes
+        assert until(arrives, WAIT_S if comes else 1) is comes
         assert bool(said) is comes, "it is not even said that it is there"
