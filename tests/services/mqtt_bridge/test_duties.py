@@ -332,7 +332,7 @@ def test_a_bridge_looks_for_them_once_it_forwards(
     monkeypatch.setattr(EarlierNames, "begin", lambda _names: begun or [later[0](*job) for job in jobs])
     rig = MemoryRig(monkeypatch)
     rig.bridge()
-    assert until(lambda: begun, 5)
+    assert until(lambda: begun)
     assert begun[0] == 0.0, "what is to be done in a minute waits"
     rig.close()
     assert "failed at the bridge" not in caplog.text
