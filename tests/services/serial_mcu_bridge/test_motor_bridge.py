@@ -164,7 +164,7 @@ def test_the_configured_watchdog_stops_once(bench: Bench) -> None:
     assert until(lambda: bench.lines[-1] == STOPPED)
     stopped = bench.mcu.trace.entries()[-1]
     assert stopped.ns / 1e9 - sent >= 0.2
-    assert (stopped.ns - moved.ns) / 1e9 < 0.75  # the default
+    assert (stopped.ns - moved.ns) / 1e9 < 0.65  # the default is 0.75
     time.sleep(0.3)  # one more timeout: the stop is not repeated
     assert bench.mcu.trace.entries()[-1] == stopped
 
