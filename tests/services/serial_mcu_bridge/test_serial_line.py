@@ -240,13 +240,14 @@ def fill(host: Host) -> float:
     return longest
 
 
-def test_old_commands_of_a_killed_host_are_thrown_away(stuck: StuckDevice, connect: Connect) -> None:
-    killed = Port(str(stuck.path), 460800)
-    assert killed.write(drive_line(0.3, 0.3) * 600) == 8400
-    killed.close()
-    assert until(connect(stuck.path, boot_s=0.05).is_ready)
-    assert until(lambda: stuck.seen().endswith(b"\n" + STOP + STOP))
-    assert len(stuck.seen()) < 5000
+def test_old_commands_of_a_killed_host_are_thrown_away(connect: Connect) -> None:
+    with closing(StuckDevice()) as stuck:
+        killed = Port(str(stuck.path), 460800)
+        assert killed.write(drive_line(0.3, 0.3) * 600) == 8400
+        killed.close()
+        assert until(connect(stuck.path, boot_s=0.05).is_ready)
+        assert until(lambda: stuck.seen().endswith(b"\n" + STOP + STOP))
+        assert len(stuck.seen()) < 5000
 
 
 def test_a_stuck_reader_does_not_block_and_finds_no_old_commands_later_and_the_stop_at_the_end(
