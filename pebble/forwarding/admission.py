@@ -33,8 +33,8 @@ class Admission:
     def refuse(self, side: Side, subject: Subject, message: Message, topic: str, *, named: bool = True) -> Drop | None:
         """Return why this message may not pass to ``topic``; None if it may. Hot.
 
-        Counts the message if its kind is limited, and remembers an unknown flag. ``named`` is False if names are
-        checked, and the message has none: such messages have a limit of their own.
+        Counts the message if its kind is limited, and remembers an unknown flag. ``named`` is False if topics
+        must name the sender's account, and this one does not: such messages have a limit of their own.
         """
         is_large = side is Side.REMOTE and len(message.payload) > MAX_COMMAND_BYTES
         if is_large and subject.kind.direction == INCOMING and not subject.is_stop:  # any payload is a stop

@@ -99,7 +99,8 @@ class Publisher:
         subject, target = self._subjects[topic], self._sides[side.other]
         if subject is None or not target.connected:
             return
-        before = b"" if subject.kind.one_shot else value  # a probe follows the topic's value, which it does not change
+        # White space behind the topic's value, or alone: a command must not run again.
+        before = b"" if subject.kind.one_shot else value
         if subject.kind.one_shot or _is_json(value):
             probe = before + self._cycles.probe(side, topic)
             target.transport.publish(topic, probe, qos=QoS.DELIVERED, urgent=subject.kind in URGENT)

@@ -100,7 +100,7 @@ class Control:
 
     @property
     def peers(self) -> frozenset[str]:
-        """Names of the other motor owners, whose turns this one needs."""
+        """Names of the other motor owners, whose grants of control (turns) this one has to receive."""
         return self.lease.peers
 
     def receive_turn(self, owner: str, turn: ControlTurn, now: float) -> None:

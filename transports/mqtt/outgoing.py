@@ -207,9 +207,9 @@ class InFlightTable:
         return self._unacked[mid][0] if mid in self._unacked else None
 
     def first_written(self, now: float) -> dict[str, int]:
-        """Return by topic the size of the largest recent message that may be why the broker hangs up.
+        """Return by topic the size of the largest recent message that may have been too large for the broker.
 
-        It is larger than all messages of its topic that the broker has accepted, as an answered ping shows.
+        Only those count that are larger than all that the broker has accepted on the topic, as answered pings show.
         """
         sizes: dict[str, int] = {}
         for written in [*(ping.written for ping in self._pings), self._written]:

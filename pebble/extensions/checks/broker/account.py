@@ -33,8 +33,8 @@ def robot_account(
 ) -> Iterator[CheckResult]:
     """Publish probe messages below ``base`` and check that the broker accepts them.
 
-    No program takes a probe for anything else. With MQTT 3.1.1, which tells no refusal, a probe must come back within
-    ``answer_s``; with MQTT 5 only if ``reads`` is given, a further filter that the broker must grant. Above the level
+    No program takes a probe for anything else. ``reads``: a further filter that the broker must grant. A probe must
+    come back within ``answer_s`` with MQTT 3.1.1, which tells no refusal, or if ``reads`` is given. Above the level
     ``open``, a probe in the name of another robot must not come back.
     """
     try:

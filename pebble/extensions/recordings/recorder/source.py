@@ -156,7 +156,7 @@ class _RetainedFetch:
 
     @property
     def failed(self) -> bool:
-        """True if time is up without a connection, or while retained messages still arrive."""
+        """True if time is up too early: there is no connection yet, or retained messages still arrive."""
         now = time.monotonic()
         return now > self._ends_at and now - self._quiet_since <= _QUIET_S
 
