@@ -40,7 +40,7 @@ def schema_text() -> str:
 
 
 def _complete(definition: dict[str, Any], kind: type[Section]) -> None:
-    """Add choices, lists as one line, comments and retired keys; drop defaults of sections, whose keys have them."""
+    """Add choices, comments, retired keys, a text for a list; drop defaults of sections, whose keys have them."""
     properties = definition["properties"]
     for field in fields(kind):
         _, metas = unwrap(field.type)

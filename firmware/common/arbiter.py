@@ -90,7 +90,7 @@ class Arbiter:
         return True
 
     def tick(self, now: int) -> None:
-        """End a hold on scripts or a script whose time is over. Call it at least every few minutes: clocks wrap."""
+        """End a hold on scripts, and a script, after their time. Call it at least every few minutes: clocks wrap."""
         diff = self._diff
         self.latch.tick(now)
         self.lease.tick(now)

@@ -60,7 +60,7 @@ class CommandAges:
         return clocks.age_s(sender, sent_s, waited_s, now, subject.waits_s)
 
     def _key(self, command: Drive) -> str:
-        """Return the key of control in a drive command, the first one in :attr:`keys`; empty if it has none of them."""
+        """Return the first of a command's keys, one per motor owner, that is in :attr:`keys`; empty if none is."""
         text, keys = command.key, self.keys
         if not isinstance(text, str) or len(text) > _LONGEST:
             return ""

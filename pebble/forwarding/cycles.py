@@ -87,7 +87,7 @@ class Cycles:
     def examine(self, side: Side, subject: Subject, message: Message) -> Finding:
         """Return the finding about a message from ``side`` that may be forwarded. Hot.
 
-        Counts the message, and notes an answered probe. What runs something may pass while its topic circulates.
+        Counts the message, notes an answered probe. Messages that start something may pass even if they circulate.
         """
         topic, payload = message.topic, message.payload
         if subject.is_stop:

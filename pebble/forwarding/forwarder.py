@@ -92,8 +92,8 @@ class Forwarder:
     ``names`` finds the senders of messages on the remote side, where they are checked.
     ``on_value(subject, payload)`` is called, on any thread and with a lock held, with each new value of a two-way
     retained topic.
-    ``pass_stop(side, payload)`` returns the payloads that pass for a stop that was received there. ``steps`` are those
-    of extensions, by their names.
+    ``pass_stop(side, payload)`` returns the payloads to forward for a stop received on ``side``. ``steps``: functions
+    of extensions that may refuse a message, by extension.
     """
 
     def __init__(

@@ -95,7 +95,7 @@ class ForwardingService(Service, ABC):
         return None
 
     def make_steps(self) -> Mapping[str, Step]:
-        """Return the steps that extensions add, by their names."""
+        """Return the functions of extensions that may refuse a message, by extension."""
         return {}
 
     def on_value(self, subject: Subject, payload: bytes) -> None:
@@ -222,7 +222,7 @@ class ForwardingService(Service, ABC):
         self.post(partial(self.disconnected, side))
 
     def shut(self) -> None:
-        """Stop forwarding, on any thread: both sides may be one broker. `found_one_broker` follows on the service's."""
+        """Stop forwarding: both sides may be one broker. Call it on any thread; it posts `found_one_broker`."""
         if self.forwarder.gate is not Gate.SHUT:
             self.forwarder.shut()
             self.post_message(BRIDGE_PROBE, self.found_one_broker)

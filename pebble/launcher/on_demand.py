@@ -33,7 +33,7 @@ class OnDemand:
         return tuple(name for name in self._supervisors if self._wanted.get(name))
 
     def environment(self, program: Program) -> dict[str, str]:
-        """Return the variables through which a new process of ``program`` learns of its requests."""
+        """Return variables for a new process: what an earlier one has requested, or the encoding to begin with."""
         if program.may_request:
             return {WANTED: " ".join(f"{name}={self._encodings[name]}" for name in self.requested)}
         return {ENCODING: self._encodings[program.name]} if program.on_demand else {}

@@ -152,7 +152,7 @@ class Control:
         self._turns.tick(now)
 
     def show_turn(self, now: float) -> None:
-        """Send the grant to the other owners if it has changed or must be repeated. Before, halt the motors."""
+        """Send the grant to the other owners if it has changed (halt the motors before that) or must be repeated."""
         if self._turn_due is not None and now >= self._turn_due:
             self._turn_due = now + _REPEAT_S
             self._turns.changed(now)

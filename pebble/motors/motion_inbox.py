@@ -127,7 +127,7 @@ class MotionInbox:
                 self._lost = True
 
     def put_drive(self, drive: p.Drive, now: float, company: tuple[Member, ...] = ()) -> bool:
-        """Put a drive command; ``company`` as in `ReceivedDrive`."""
+        """Put a drive command. ``company``: this motor owner's other commands in the same group."""
         with self._lock:
             was_empty = self._empty
             sender = run_of(drive)

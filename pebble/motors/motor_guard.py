@@ -176,7 +176,7 @@ class MotorGuard:
             self._barred_file.save(self._barred)
 
     def appeared_stop(self) -> EstopCommand | None:
-        """Return a stop that this owner does not know, from a file that has just appeared (a late mount), or None.
+        """Return a stop that this owner does not know, from a file on a disk that was mounted late, or None.
 
         A file that has appeared without such a stop is overwritten with the state here, which is newer.
         """

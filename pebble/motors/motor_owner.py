@@ -133,7 +133,7 @@ class MotorOwner(Service, ABC):
         self._judge_soon(self._waiting.put_request(request, True, arrived))
 
     def set_up(self) -> None:
-        """Start and subscribe, also to the turns of other motor owners if there are any."""
+        """Start and subscribe, also to the grants of control that other motor owners publish."""
         self.transport.on_state(self._waiting.note_state)
         super().set_up()
         receive = self.refusals.reader(c.CONTROL_TURN, self._receive_turn)

@@ -52,7 +52,7 @@ class StateFile:
             return True
 
     def can_save(self) -> bool:
-        """True if the folder can be written or made; also if it is :attr:`lost`: each write then reports a failure."""
+        """True if a write may be tried: its folder can be written or made, or is :attr:`lost`, as a write reports."""
         existing = next(folder for folder in self.path.parents if os.access(folder, os.F_OK))
         return self.lost or (existing.is_dir() and os.access(existing, os.W_OK | os.X_OK))
 
@@ -81,7 +81,7 @@ class StateFile:
             return Unreadable()
 
     def appeared(self) -> Any:
-        """Return the value in a file that this process has not written (a late mount), as :meth:`load`; else None."""
+        """Return what :meth:`load` reads, on a disk mounted late for example; None if this process wrote the file."""
         try:
             return None if self._own is not None and not self._own.replaced else self.load()
         except OSError:

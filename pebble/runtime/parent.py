@@ -120,7 +120,7 @@ class Notifier:
         return self._write(notes.Wanted(program, request.on, request.encoding))
 
     def hold(self, program: str, on: bool) -> bool:
-        """End an on-demand program, or let it run again, as the end of this process also does. See :meth:`request`."""
+        """End an on-demand program; with ``on`` False, or once this process ends, it may run. See :meth:`request`."""
         return self._write(notes.Held(program, on))
 
     def feature(self, name: str, has: bool) -> bool:

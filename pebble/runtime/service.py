@@ -290,7 +290,7 @@ class Service:
     def _handle(self, channel: Channel, method: Callable[[], None], arrived: float) -> None:
         """Call the handler, unless the message has waited too long in a hung or suspended process.
 
-        Only commands that a newer command replaces are dropped.
+        Only commands on channels with ``newest`` are dropped.
         """
         if channel.kind is Kind.COMMAND and channel.newest and self.clock() - arrived > WAIT_LIMIT_S:
             self.count_late(channel)

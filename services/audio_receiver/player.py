@@ -50,7 +50,7 @@ class Player:
             self._failed(f"{self._name} is not installed", time.monotonic())
 
     def play(self, chunk: Chunk) -> None:
-        """Write samples to the program; drop them if it cannot be started, or has just changed its format."""
+        """Write samples to the program; drop them if it cannot be started, or was just started for another format."""
         now = self._played_at = time.monotonic()
         if self._child is not None and (chunk.rate, chunk.channels) != self._format:
             if now - self._started_at < _CHANGE_S:

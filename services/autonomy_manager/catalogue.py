@@ -274,7 +274,7 @@ def files(scripts: Iterable[Script]) -> list[dict[str, object]]:
 
 
 def _first_seen(script: Script, configs: Iterable[Mapping[str, object]]) -> dict[str, object]:
-    """Return a script entry's optional fields: summary, settings to show first, and whether it was not asked yet."""
+    """Return an entry's optional fields: ``summary``, ``main`` (settings to show first), ``asked`` (only if False)."""
     keys = {setting["key"] for setting in configs}
     first = {"summary": script.summary, "main": [key for key in script.main if key in keys]}
     unasked = {} if script.asked else {"asked": False}

@@ -82,7 +82,7 @@ class Runner:
 
     @property
     def stoppable(self) -> Run | None:
-        """The run to end at a stop, or the ending run whose successor to cancel; None if neither may move the robot."""
+        """The active run or, while a start waits, the ending one; None if neither run nor start may move the robot."""
         if not self.drives:
             return None
         return self.active if self._next is None else self._run

@@ -302,7 +302,7 @@ class MqttBridge(ForwardingService):
 
     @every(PERIOD_S)
     def _vouch(self) -> None:
-        """Tell the motor owners until when they have been sent all messages."""
+        """Tell the motor owners in which period all messages to them were forwarded in time."""
         if not self.config.motor_owners:
             return
         gate, counters = self.forwarder.gate, self.forwarder.counters

@@ -183,9 +183,9 @@ class Dialler:
         return was_ended and not was_silent and now - self._gone_at <= _ENDING_S
 
     def failed(self, problem: str, held_s: float) -> tuple[str, bool]:
-        """End the turn of the address, unless its broker will be asked once more in another way.
+        """Go on to the host's next address, unless this broker will be asked once more in another way.
 
-        ``held_s``: how long it was connected, or 0. Return the problem in words ("": none yet), and True to log it.
+        ``held_s``: how long a connection lasted, or 0. Return the problem in words ("": none yet), and True to log it.
         """
         addresses, asks_again = self.addresses, self.limits.asks_again
         if self._is_last_attempt and not asks_again:

@@ -124,7 +124,7 @@ class OwnMessageFilter:
         return False
 
     def is_repeat(self, message: Message) -> bool:
-        """True, once, if the broker repeats a retained message because of `subscribe_again`. Remembers each message."""
+        """True if this is the repeated message that `subscribe_again` expects on its topic. Remembers the message."""
         known_digest, digest = self._seen.get(message.topic), _digest(message)
         self._seen[message.topic] = digest
         if known_digest != digest or message.topic not in self._repeats:

@@ -49,7 +49,7 @@ def hub_file(keys: str) -> dict[str, Any]:
 
 
 def boards_file(fleet: Fleet, name: str, below: str) -> dict[str, Any]:
-    """Return the config file of the gateway for boards whose account is ``name``; its password's file is beside it.
+    """Return the config file of the boards' gateway, which logs in as ``name``; its password is in a file beside it.
 
     The gateway also connects to the LAN's hub, once for each board, with the account that the board has as a neighbour.
     ``below``: the prefix in that file for paths of certificates, which are in the fleet's folder.

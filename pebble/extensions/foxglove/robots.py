@@ -28,7 +28,7 @@ _MEDIA: Final[tuple[Medium, ...]] = ("video", "audio")
 
 
 def filters(base: str) -> list[str]:
-    """Return the topic filters for the telemetry of these robots, without pictures and sound. None covers another."""
+    """Return topic filters for the telemetry of robots at ``base``, without media. No filter covers another."""
     filters_ = list(dict.fromkeys(channel.filter(base) for channel in (*FLEET, *WATCHED, *SYNONYMS)))
 
     def is_covered(filter_: str) -> bool:

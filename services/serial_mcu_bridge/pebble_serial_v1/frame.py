@@ -125,6 +125,6 @@ def _full_blocks(part: bytes) -> bytes:
 
 
 def _block(part: bytes) -> bytes:
-    """Return the end of ``part``, after its full blocks, as a COBS block, which also encodes a zero behind ``part``."""
+    """Return the last COBS block of ``part``: the bytes after its full blocks. It also stands for a zero after them."""
     last = part[len(part) - len(part) % _BLOCK :]
     return bytes((len(last) + 1,)) + last

@@ -62,7 +62,7 @@ def unit_of(properties: Mapping[str, str]) -> CheckResult:
 
 
 def slot(robot: RobotUnderTest) -> CheckResult:
-    """Check that the running slot is the active one, and complete."""
+    """Check that the running slot (an installed version, see `Places.slots`) is the active one, and complete."""
     places = robot.places
     if not places.slots.is_dir() or not (places.slots / "active").is_symlink():
         return skipped("it is not installed in slots")

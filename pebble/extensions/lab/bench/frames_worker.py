@@ -143,7 +143,7 @@ class MqttWriter:
 
 
 class MqttReader:
-    """A reader that runs paho's network loop in its own thread, which saves a switch of threads."""
+    """A reader that runs paho's network loop on the reading thread, which saves a switch of threads."""
 
     def __init__(self, port: int) -> None:
         self._arrived: deque[bytes] = deque(maxlen=1)

@@ -59,7 +59,7 @@ class NamedTopics:
             raise NoNameError(command.identity.id, self.account)
 
     def signed(self, topic: str, payload: bytes, person: str) -> bytes:
-        """Return a command's payload with the person for whom this client acts, if its topic will name the account.
+        """Return a command's payload with the person for whom this client acts, if the robot needs accounts in topics.
 
         A payload that names a sender itself is unchanged.
         """

@@ -151,7 +151,7 @@ class TerminalDriver:
         return " · ".join(filter(None, parts))
 
     def _assume(self, now: float) -> None:
-        """Assume that a silent board drives, once it has been online for a while, if the person says so."""
+        """Assume that a board without capabilities drives after some seconds online, if the person says so."""
         if self._assumes:
             self._heard_at = min(self._heard_at, now) if self.robot.online(now) else float("inf")
             if now - self._heard_at >= HEARD_S:

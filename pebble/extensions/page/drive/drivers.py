@@ -126,9 +126,9 @@ class Drivers:
         return bool(commands) and commands[0].drive.moves, ""
 
     def accompany(self, tab: Tab, ref: str, channel: Channel, message: Message) -> bool:
-        """Keep lights for the next drive command, if this page's gesture moves the robot; return False if not.
+        """Keep lights, to send them in a group with the next drive command; return False if they are not kept.
 
-        The caller then sends them. Both go in one message, a group: the robot must list their metrics as ``groups``.
+        They are kept while this page's gesture moves a robot whose ``groups`` list both. If not, the caller sends them.
         """
         groups = self._robots.capabilities(ref).get("groups")
         takes_group = isinstance(groups, list) and DRIVE.metric in groups and channel.metric in groups

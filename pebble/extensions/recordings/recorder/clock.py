@@ -54,7 +54,7 @@ class Due:
     def every(self, what: str, seconds: float) -> bool:
         """True if the task ``what`` is due: ``seconds`` have passed since it was due last.
 
-        At the first call for it, the task is due if this object is that old already; otherwise ``seconds`` later.
+        At its first call a task is due if this object is ``seconds`` old by then, else ``seconds`` after that call.
         """
         now = self._boot_ns()
         if now - self._done.get(what, self._began) < seconds * 1e9:

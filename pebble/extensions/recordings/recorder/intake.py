@@ -75,7 +75,7 @@ class Intake:
             self._counters["dropped"] += messages
 
     def add_order(self, topic: str, source: str) -> None:
-        """Add a request to the writer, such as FORGET: its ``topic``. It keeps its place among the messages."""
+        """Queue a request to the writer, such as the ``topic`` FORGET. It is handled in order with the messages."""
         self._events.append(Item(self._boot_ns(), topic, b"", None, None, "", source))
 
     def take(self) -> list[Item]:

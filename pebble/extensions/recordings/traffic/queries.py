@@ -32,8 +32,8 @@ def _numbers(numbers: Iterable[int]) -> str:
 def _percentile(value: str, share: float) -> str:
     """Return SQL for the quantile ``share`` of ``value``, interpolated linearly.
 
-    In its table the rows are numbered by ``place`` in the order of the values, from 0 to ``last``. Equal to
-    ``quantile_cont``, which would hold all values in memory; sorting can use files.
+    The queried table must have ``place``, a row's number in the order of the values from 0, and ``last``, the number of
+    the last row. Equal to ``quantile_cont``, which would hold all values in memory; sorting can use files.
     """
     return f"sum({value} * greatest(0, 1 - abs(place - {share} * last)))"
 

@@ -94,9 +94,9 @@ class ViewerRequest:
     def tick(self, now: float) -> list[Message]:
         """Return the messages to send now.
 
-        First wait a moment (:meth:`_waits_s`) for a sign that the medium is running already. Then send nothing, unless
-        another encoding is wanted here and no other client uses the medium. Without a sign, raise the flag if it is
-        down, and send the request. From then on, repeat the request whenever no payload has come for a while.
+        First wait a moment (:meth:`_waits_s`) for a sign that the medium runs already. If it does, send nothing, unless
+        another encoding is wanted here and no other client uses the medium. Otherwise raise the flag if it is down,
+        and send the request. After either, repeat the request whenever no payload has come for a while.
         """
         if self.settled:
             is_quiet = now - max(self._sent_at, self._received_at) > _REPEAT_S
