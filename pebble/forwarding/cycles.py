@@ -163,7 +163,7 @@ class Cycles:
         return Finding.RELAY
 
     def _close(self, side: Side, topic: str) -> None:
-        """Note that what is forwarded from ``side`` on ``topic`` comes back there."""
+        """Close a way: what is forwarded from ``side`` on ``topic`` comes back there."""
         way = self._way(side, topic)
         way.unanswered = 0
         if way.closed or len(self.closed_ways) >= _MOST_CLOSED:
@@ -182,7 +182,7 @@ class Cycles:
         self.closed_ways.add((side, topic))
 
     def _open(self, side: Side, topic: str) -> None:
-        """Note that what is forwarded from ``side`` on ``topic`` comes back no more."""
+        """Open a way: what is forwarded from ``side`` on ``topic`` comes back no more."""
         self._ways[side, topic].closed = False
         self.closed_ways.discard((side, topic))
         if not self.closed_ways:

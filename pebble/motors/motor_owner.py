@@ -340,7 +340,7 @@ class MotorOwner(Service, ABC):
         self._arm_guard()
 
     def _publish_state(self, state: p.EstopState) -> None:
-        """Publish the state. While stops do not latch, clear its topic each time: a bridge may miss one message."""
+        """Publish ``state``; while stops do not latch, clear its topic at each call: a bridge may miss a clearing."""
         if self._latches:
             self.publish(c.ESTOP_STATE, state, owner=self.owner)
         else:

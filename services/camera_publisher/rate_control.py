@@ -153,7 +153,7 @@ SMALL = 6  # of them: small pictures, as many as are configured
 class LevelControl:
     """The choice among STEPS: down at once as far as necessary, up one step at a time.
 
-    After each step up that failed, the next one comes later. From a reduced ``level`` at the begin, they come soon.
+    After each step up that failed, the next one comes later; the first ones from a reduced start (``level``) come soon.
     """
 
     def __init__(self, fps: float, now: float, level: int = 0) -> None:

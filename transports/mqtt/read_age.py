@@ -170,6 +170,6 @@ class ReadAge:
         self.arriving_at = clock.since_boot()
 
     def note_handled(self) -> None:
-        """Note that retained messages were handled, which may have taken longer than an answer to a ping may."""
+        """Note that retained messages were handled: while this was done, the broker does not count as silent."""
         self.note_arriving()
         self.has_retained = False
