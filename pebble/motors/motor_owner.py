@@ -154,7 +154,7 @@ class MotorOwner(Service, ABC):
             self._judge_soon(self._waiting.put_drive(drive, arrived))
 
     def is_copy(self, command: p.Drive | p.LightsSolid) -> bool:
-        """True if ``command`` is a copy from a message `c.GROUP`, and this motor owner takes that message itself."""
+        """True if ``command`` is a copy of a member of a group (`c.GROUP`), and this motor owner takes whole groups."""
         return self._takes_groups and command.group is True
 
     def _receive_group(self, message: Message, _value: Any, _names: dict[str, str]) -> None:
