@@ -54,7 +54,7 @@ class _Clock:
 
     @property
     def standing(self) -> tuple[float, float]:
-        """Sort key for forgetting clocks: first those with messages over the shortest time, then the longest silent."""
+        """Sort key for forgetting: the shortest time from first to newest message; if equal, the longest silence."""
         return self.received_at - self.began, self.received_at
 
 

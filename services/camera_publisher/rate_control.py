@@ -170,7 +170,7 @@ class LevelControl:
         return STEPS[self.level]
 
     def lost(self, turns: float, now: float) -> None:
-        """Note that frames could not be sent, because earlier ones were late; ``turns``: how many."""
+        """Note that so many ``turns`` (see FrameSelector) passed without a frame, because earlier frames were late."""
         if now - (turns + 1) * self._frame_s > self._changed_at:  # else those before them were of another step
             self._lost.append((now, turns))
 
