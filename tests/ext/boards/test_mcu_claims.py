@@ -196,7 +196,7 @@ def cleared(metric: str) -> Message:
 
 FAST, SLOW = ("mcu/spy-1/fast", "lab/fast"), ("mcu/spy-1/slow", "lab/slow")
 KNOWN = local_only(*LISTED)
-NONSENSE = (b"", b"{", b'{"device_uid": 5}', b'["device_uid"]', b"\xff\xfe", sample("slow"))
+NONSENSE = (b"", b"{", b'{"device_uid": 5, "interface": "a"}', b'["device_uid"]', b"\xff\xfe", sample("slow"))
 #: What is offered one after the other, and what passes then: the message, nothing, or the topics that are named.
 HISTORIES: dict[str, list[tuple[Message, bool | list[str]]]] = {
     "what is listed stays, and what is not passes": [
