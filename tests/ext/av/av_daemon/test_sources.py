@@ -170,8 +170,8 @@ class TestAlsa:
         capture = alsa_microphone().grab()
         assert (capture.data, capture.skipped) == (sound[-640:], 14)
         monkeypatch.setattr(alsa.AlsaMicrophone, "read", lambda _self: sound[: 640 * 5])
-        late_ns = time.monotonic_ns() - alsa_microphone().grab().at_ns
-        assert late_ns == pytest.approx(-4 * 20e6, abs=1e9), "what waits behind it was recorded after it"
+        at_ns = alsa_microphone().grab().at_ns
+        assert 4 * 20_000_000 <= time.monotonic_ns() - at_ns < 5_000_000_000, "others came after it"
 
 
 @pytest.fixture(scope="session")
