@@ -23,7 +23,8 @@ class SparingBroker:
     def __init__(self, to: int, *, by_name: bool = False, longest: int = 1 << 28) -> None:
         self.port, self._to, self._by_name = free_port(), to, by_name
         self._longest, self.stalled, self.segment = longest, 0, 0
-        self._loop = asyncio.new_event_loop()
+        self._runner = asyncio.Runner(loop_factory=asyncio.new_event_loop)
+        self._loop = self._runner.get_loop()
         self._loop.run_until_complete(asyncio.start_server(self._serve, "127.0.0.1", self.port))
         self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
         self._thread.start()
@@ -31,6 +32,7 @@ class SparingBroker:
     def close(self) -> None:
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
+        self._runner.close()
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         asked: list[bytes] = []

@@ -30,6 +30,11 @@ T = TypeVar("T")
 
 _LONGEST_PAUSE_S = 0.03
 
+#: For what comes at once on a machine with nothing else to do: a wait ends with it, so only failures take as long.
+WAIT_S = 30.0
+#: For what must not wait for something that lasts WAIT_S or longer: a busy machine's share, and far from that.
+SOON_S = 5.0
+
 
 #: `make test THOROUGH=1` sets it: tests with many cases then try all of them.
 THOROUGH = bool(os.environ.get("PEBBLE_THOROUGH"))
@@ -65,7 +70,7 @@ def beside(work: Callable[[], object], ending: threading.Event) -> Iterator[None
         thread.join()
 
 
-def until(condition: Callable[[], object], timeout: float = 10.0, *, step: float = 0.003) -> bool:
+def until(condition: Callable[[], object], timeout: float = WAIT_S, *, step: float = 0.003) -> bool:
     """Wait until ``condition()`` is true; return False if that takes more than ``timeout`` seconds.
 
     The pauses between two checks grow from ``step``: many tests wait at the same time, and checking takes processor
@@ -78,6 +83,14 @@ def until(condition: Callable[[], object], timeout: float = 10.0, *, step: float
         time.sleep(step)
         step = max(step, min(1.2 * step, _LONGEST_PAUSE_S))
     return bool(condition())
+
+
+@contextmanager
+def quickly() -> Iterator[None]:
+    """Check that the block waits for nothing that holds others up."""
+    began = time.monotonic()
+    yield
+    assert time.monotonic() - began < SOON_S
 
 
 def errors(caplog: pytest.LogCaptureFixture) -> list[str]:
@@ -177,7 +190,7 @@ class Broker:
 
     def start(self) -> None:
         self._process = Child(self._command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        assert until(self.answers, 30), f"mosquitto did not start: {self._command}"
+        assert until(self.answers), f"mosquitto did not start: {self._command}"
 
     def stop(self) -> None:
         """Stop with SIGTERM: persistence is written. With its security plugin it has been seen to hang then, once."""
@@ -212,7 +225,7 @@ class Broker:
     def end(self, how: Callable[[subprocess.Popen[bytes]], None]) -> None:
         if self._process is not None:
             how(self._process)
-            self._process.wait(10)
+            self._process.wait(WAIT_S)
             self._process = None
 
     def answers(self) -> bool:
@@ -267,12 +280,12 @@ class AmqttBroker:
     def start(self) -> None:
         command = [sys.executable, "-m", "pebble.extensions.lab.demo.brokers", str(self.port)]
         self._process = Child(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        assert until(lambda: listening(self.port), 20), "amqtt did not start"
+        assert until(lambda: listening(self.port)), "amqtt did not start"
 
     def stop(self) -> None:
         if self._process is not None:
             self._process.kill()
-            self._process.wait(10)
+            self._process.wait(WAIT_S)
             self._process = None
 
 

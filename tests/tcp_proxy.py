@@ -13,7 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from tests.support import free_port
+from tests.support import WAIT_S, free_port
 
 _STEP_S = 0.02  # how soon a change of mode is noticed
 _RESET = struct.pack("ii", 1, 0)  # SO_LINGER that turns close() into a reset
@@ -59,7 +59,7 @@ class TcpProxy:
         listener, self._listener = self._listener, None
         if listener is not None and self._thread is not None:
             listener.close()
-            self._thread.join(5)
+            self._thread.join(WAIT_S)
         self.drop()
 
     def mend(self) -> None:
@@ -277,7 +277,7 @@ class _Pair:
 
     def join(self) -> None:
         for thread in self._threads:
-            thread.join(5)
+            thread.join(WAIT_S)
 
     def _carry(self, source: socket.socket, sink: socket.socket) -> None:
         with suppress(OSError, ValueError):  # an end was closed

@@ -23,7 +23,7 @@ from pebble.extensions.lab.demo.main import SHORTEST_S
 from pebble.extensions.lab.demo.operator import STEPS
 from pebble.extensions.lab.rig.testbed import ROBOTS
 from tests.kit.demo import START_S, Demo, demos, page_of, start, temporary
-from tests.support import ROOT, until
+from tests.support import ROOT, WAIT_S, until
 
 __all__ = ["demos", "temporary"]
 
@@ -35,7 +35,7 @@ SLOW_S, END_S = 60.0, 5.0
 def requested(url: str) -> str:
     unverified = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     unverified.check_hostname, unverified.verify_mode = False, ssl.CERT_NONE
-    with urllib.request.urlopen(url, timeout=5, context=unverified) as answer:
+    with urllib.request.urlopen(url, timeout=WAIT_S, context=unverified) as answer:
         return str(answer.read().decode())
 
 
@@ -95,7 +95,7 @@ def recorded_robots(page: str) -> list[str]:
 
 def shell(line: str) -> str:
     """What a line prints that must succeed."""
-    done = subprocess.run(line, shell=True, cwd=ROOT, capture_output=True, text=True, timeout=20, check=False)
+    done = subprocess.run(line, shell=True, cwd=ROOT, capture_output=True, text=True, timeout=WAIT_S, check=False)
     assert done.returncode == 0, (line, done.stdout, done.stderr)
     return done.stdout
 

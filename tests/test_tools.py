@@ -11,7 +11,7 @@ import pytest
 
 from pebble.extensions.lab.demo.main import SHORTEST_S
 from tests.kit import rows
-from tests.support import ROOT
+from tests.support import ROOT, WAIT_S
 
 
 def test_each_test_of_which_some_rows_run_is_there() -> None:
@@ -27,7 +27,7 @@ def test_a_demo_with_wrong_options_is_refused_before_the_set_up(tmp_path: Path, 
     shutil.copy(ROOT / "Makefile", tmp_path)  # without anything to set up
     command = ["make", "demo", *options.split()]
     done = subprocess.run(
-        command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=20, stdin=subprocess.DEVNULL
+        command, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=WAIT_S, stdin=subprocess.DEVNULL
     )
     assert done.returncode == 2
     assert why in done.stderr

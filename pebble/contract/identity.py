@@ -94,7 +94,7 @@ def composed(name: str) -> str:
 
 
 def untypeable(name: str) -> str:
-    """Return the words after a name that say why people cannot type it, and what to write instead; "" if they can."""
+    """Return why people cannot type a name, and the fix, as the rest of a sentence that it begins; "" if they can."""
     if name in (".", ".."):
         return "is a folder, and no name: write another"
     return "" if composed(name) == name else f"has a letter that no keyboard writes: write {json.dumps(composed(name))}"

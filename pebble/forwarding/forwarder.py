@@ -181,10 +181,10 @@ class Forwarder:
         """True if retained messages of ``topic`` do not pass; counts and logs this message then. For TopicPolicy."""
         if self._names is not None and topic.endswith(_STOP) and self._is_stop(topic.decode(errors="replace")):
             return False  # it may be a live stop, with a name in its topic
-        kind = self.subjects.invented(topic)
+        kind = self.subjects.invented(topic)  # a flag or a command that the contract does not know
         if kind is None or (kind is Kind.FLAG and not self._admission.refuses_flag(topic)):
             return False  # the contract knows it, or it is an unknown flag for which there is room
-        drop = Drop.TOO_MANY if kind is Kind.FLAG else Drop.STALE
+        drop = Drop.TOO_MANY if kind is Kind.FLAG else Drop.STALE  # a retained command
         self.sides[side].window.note()  # while retained messages come, a stop may be an old one
         self.counters.add(f"{side.value}: {drop.value}")
         self._warn(drop, topic[:_LOGGED].decode(errors="replace"))

@@ -39,7 +39,10 @@ class RetainedTopics:
     def receive(
         self, source: SideState, subject: Subject, message: Message, forward: Forward, *, only_old: bool = False
     ) -> Forward | Drop:
-        """Forward a message that will be retained, or return why not. ``only_old``: refuse it if it is live."""
+        """Forward a message that will be retained, or return why not.
+
+        ``only_old``: refuse a live message; what a broker had retained may pass.
+        """
         with self._lock:
             self._begin_restarted()
             if subject.kind in self._both_ways:
@@ -118,7 +121,7 @@ class RetainedTopics:
     # -- with the lock held
 
     def _reconcile(self, source: SideState, subject: Subject, message: Message, *, only_old: bool) -> Drop | None:
-        """Return why a two-way message must not pass; None if it may. ``only_old``: refuse a live message."""
+        """Return why a two-way message must not pass; None if it may. ``only_old``: see `receive`."""
         side, topic, payload, transport = source.side, message.topic, message.payload, source.transport
         if message.retain and topic in source.seen and transport.policy.delivers_late and not transport.as_published:
             return Drop.KNOWN  # certainly retained, and came late: it is older than the live one before it

@@ -17,7 +17,7 @@ import pytest
 from pebble.commands import app
 from pebble.extension import ours
 from tests.commands.command_line import Run, config_file
-from tests.support import ROOT, cases, free_port, some, until
+from tests.support import ROOT, WAIT_S, cases, free_port, some, until
 
 NAMES = [tuple(words.split()) for words in app.commands(["up"])]
 
@@ -103,9 +103,9 @@ def test_a_robot_runs_without_standard_streams(tmp_path: Path, closed: str) -> N
     command = [sys.executable, "-m", "pebble.cli", "up", str(config)]
     with subprocess.Popen(["sh", "-c", f'exec "$@" {closed}', "sh", *command], cwd=ROOT) as robot:
         children = Path(f"/proc/{robot.pid}/task/{robot.pid}/children")
-        assert until(lambda: robot.poll() is not None or children.read_text(), 30)
+        assert until(lambda: robot.poll() is not None or children.read_text())
         robot.terminate()
-        assert robot.wait(20) == 0
+        assert robot.wait(WAIT_S) == 0
 
 
 def test_a_command_whose_package_is_missing_says_what_to_install() -> None:

@@ -153,6 +153,7 @@ ENCODED: list[tuple[bytes, str]] = [
     (TEXT.encode("utf-16-be"), "is not UTF-8 at its byte"),
     (TEXT.encode("latin-1"), "is not UTF-8 at its byte 24, in line 3: save it as UTF-8"),
     (TEXT.encode() + b"\0", "is not UTF-8 at its byte"),
+    (b"\n\xff", "is not UTF-8 at its byte 1, in line 2"),
 ]
 
 

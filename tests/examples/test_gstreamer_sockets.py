@@ -19,7 +19,7 @@ import pytest
 from pebble.extensions.media.frames import FrameInfo
 from pebble.transports.segments import SHM
 from tests.ext.av.media_rig import Device
-from tests.support import ROOT, Child, until
+from tests.support import ROOT, WAIT_S, Child, until
 
 #: `make long PART=gstreamer` installs it.
 pytestmark = pytest.mark.skipif(shutil.which("gst-launch-1.0") is None, reason="GStreamer is not installed")
@@ -71,14 +71,14 @@ class Sockets:
 
     def start(self) -> None:
         self.process = Child([sys.executable, str(EXAMPLE), str(self._config)], cwd=ROOT, stderr=subprocess.PIPE)
-        assert until(lambda: self.video.is_socket() and self.audio.is_socket(), 20)
+        assert until(lambda: self.video.is_socket() and self.audio.is_socket())
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.process.terminate()
-        self.process.wait(10)
+        self.process.wait(WAIT_S)
 
 
 class Reader:
@@ -99,14 +99,14 @@ class Reader:
     def gets(self, more: int) -> bool:
         """Wait for so many further frames."""
         wanted = len(self.frames) + more
-        return until(lambda: len(self.frames) >= wanted, 15)
+        return until(lambda: len(self.frames) >= wanted)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.process.kill()
-        self.process.wait(10)
+        self.process.wait(WAIT_S)
 
 
 def picture_reader(path: Path, width: int = WIDTH, height: int = HEIGHT) -> Reader:
@@ -150,7 +150,7 @@ def test_readers_end_with_it_and_find_the_next_one(tmp_path: Path) -> None:
             assert reader.gets(5)
             sockets.process.send_signal(signal.SIGKILL)
             assert until(lambda: reader.process.poll() is not None), "scripts open it again"
-        sockets.process.wait(10)
+        sockets.process.wait(WAIT_S)
         left = set(SHM.glob("shmpipe.*")) - before
         assert len(left) <= 1
         for segment in left:

@@ -86,7 +86,7 @@ def test_topics_of_any_length_hold_up_nothing_nor_does_a_missing_internet(
     robot = Child(list(map(str, [*sample(tmp_path), "mine", "127.0.0.1", broker.port, tmp_path / "stop"])))
     try:
         for state in ("capabilities", "estop/motors"):  # before the first it has subscribed
-            operator.wait_for(f"outgoing/{state}", 20)
+            operator.wait_for(f"outgoing/{state}")
         for _ in range(50):  # more than a broker sends unacknowledged
             operator.send("incoming/" + 1500 * "x", {})
         for z in (0, 0.5):  # after its start it waits for a zero

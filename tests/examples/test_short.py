@@ -19,7 +19,7 @@ from pebble.extensions.scripts.perception.odom_follow import Pose
 from pebble.extensions.scripts.perception.tags import Place
 from pebble.transports import Message, MqttSettings, create
 from tests.ext.recordings.playing import Line, js, write
-from tests.support import ROOT, Broker, Child, free_port, until
+from tests.support import ROOT, WAIT_S, Broker, Child, free_port, until
 
 GOOB = "pebble/robots/goob"
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
@@ -62,9 +62,9 @@ def test_the_service_publishes_on_a_topic_of_its_own(broker: Broker, tmp_path: P
     with create("mqtt", "operator", MqttSettings(host="127.0.0.1", port=broker.port)) as operator:
         operator.subscribe(f"{GOOB}/outgoing/uptime", received.put)
         with Child(example("service", config), env=ENVIRONMENT) as program:
-            assert json.loads(received.get(timeout=30).payload)["seconds"] > 0
+            assert json.loads(received.get(timeout=WAIT_S).payload)["seconds"] > 0
             program.terminate()
-            assert program.wait(10) == 0
+            assert program.wait(WAIT_S) == 0
 
 
 def test_the_extension_adds_a_section_a_line_and_a_check(tmp_path: Path) -> None:
@@ -85,7 +85,7 @@ def test_the_transport_carries_messages_between_two_clients() -> None:
     with Datagrams("robot", here) as robot, Datagrams("operator", here) as operator:
         operator.subscribe("pebble/+/+/outgoing/online", received.put)
         assert robot.publish(f"{GOOB}/outgoing/online", b"{}")
-        message = received.get(timeout=10)
+        message = received.get(timeout=WAIT_S)
         assert (message.topic, message.payload) == (f"{GOOB}/outgoing/online", b"{}")
 
 
@@ -104,7 +104,7 @@ def test_a_twist_drives_the_robot(broker: Broker) -> None:
         robot.subscribe("pebble/robots/goob/incoming/drive-values", received.append)
         command = [sys.executable, str(program), "127.0.0.1", str(broker.port), "goob"]
         with Child(command, env=ENVIRONMENT) as child:
-            assert until(lambda: writer.write(twist) or received, 30)
+            assert until(lambda: writer.write(twist) or received)
             child.kill()
     assert json.loads(received[0].payload) == {"x": 0.5, "z": 0.5, "valid_ms": 500}
 

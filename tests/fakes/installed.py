@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support import ROOT, until
+from tests.support import ROOT, WAIT_S, until
 
 _STARTS = "FAKE_STARTS"  # a file with the process id of every start
 
@@ -31,7 +31,7 @@ class Installed:
         """Process ids of all its starts, in order."""
         return [int(line) for line in self._starts.read_text().split()] if self._starts.exists() else []
 
-    def gone(self, pid: int, timeout: float = 5.0) -> bool:
+    def gone(self, pid: int, timeout: float = WAIT_S) -> bool:
         """True if this process has ended and was reaped."""
         return until(lambda: not Path(f"/proc/{pid}").exists(), timeout)
 

@@ -24,7 +24,7 @@ from tests.firmware.drill import BASE, DRIVE, ESTOP, LIMIT_S, RESET, STALE_S, ST
 from tests.firmware.test_deadman_virtual import HOSTILE
 from tests.firmware.wireless_rig import Robots
 from tests.robot.operator import Operator
-from tests.support import ROOT, Broker, Child, until
+from tests.support import ROOT, SOON_S, WAIT_S, Broker, Child, quickly, until
 from tests.tcp_proxy import TcpProxy
 from wifi import sockets
 
@@ -242,7 +242,6 @@ def test_what_tls_could_not_send_comes_again_as_it_was(monkeypatch: pytest.Monke
 # -- with real sockets and a real broker: as programs
 
 
-END_S = 1.0
 NAME = 'The "lamp", naïve'  # as JSON must escape it
 
 
@@ -287,20 +286,19 @@ def test_one_is_driven_and_ends_at_once_by_a_signal_with_motors_off(start: Any, 
         return [entry.motors for entry in read_trace(trace)]
 
     with closing(Operator(broker.port, "pebble/robots/minilamp")) as operator:
-        assert until(lambda: len(operator.on("outgoing/online")) > 1, 15), program.err
+        assert until(lambda: len(operator.on("outgoing/online")) > 1), program.err
         operator.send("incoming/drive-values", {"z": 1.0})
-        assert until(lambda: motors() == [(1.0, 1.0), (0.0, 0.0)], 5)
+        assert until(lambda: motors() == [(1.0, 1.0), (0.0, 0.0)])
         began, ended = read_trace(trace)
-        assert 0.8 <= (ended.ns - began.ns) / 1e9 <= 1.2  # after the last command
+        assert 0.8 <= (ended.ns - began.ns) / 1e9 < SOON_S  # after the last command
         assert f"connected to the broker at {address}" in program.err
         identity = operator.on("outgoing/capabilities")[-1].json["value"]["identity"]
         assert identity == {"system": "pebble", "type": "robots", "id": "minilamp", "name": NAME}
         operator.send("incoming/drive-values", {"z": 1.0})
         assert until(lambda: motors()[-1] == (1.0, 1.0))
         program.process.send_signal(signal.SIGTERM)
-        signalled = time.monotonic()
-        assert program.process.wait(10) == 0
-        assert time.monotonic() - signalled <= END_S
+        with quickly():
+            assert program.process.wait(WAIT_S) == 0
         assert motors()[-1] == (0.0, 0.0)
 
 
@@ -316,7 +314,7 @@ def test_its_files_survive_a_killed_program_which_is_published_as_offline(
         def became(metric: str, **fields: Any) -> bool:
             """Wait until the newest message has these fields."""
             return until(
-                lambda: any(fields.items() <= one.json.items() for one in operator.on(f"outgoing/{metric}")[-1:]), 15
+                lambda: any(fields.items() <= one.json.items() for one in operator.on(f"outgoing/{metric}")[-1:])
             )
 
         assert became("estop/mcu", latched=False), program.err
@@ -332,11 +330,10 @@ def test_its_files_survive_a_killed_program_which_is_published_as_offline(
 def test_a_fleet_takes_turns_of_kinds_shows_its_status_and_ends_in_order(start: Any, broker: Broker) -> None:
     with closing(Operator(broker.port, "pebble/robots")) as operator:
         program = start("fleet", f"mqtt://127.0.0.1:{broker.port}", "-n", "3")
-        assert until(lambda: b"3 robots: connected" in program.out, 20), program.err
+        assert until(lambda: b"3 robots: connected" in program.out), program.err
     program.process.send_signal(signal.SIGTERM)
-    began = time.monotonic()
-    assert program.process.wait(10) == 0
-    assert time.monotonic() - began < 2.0
+    with quickly():
+        assert program.process.wait(WAIT_S) == 0
     assert "3 of 3 online" in program.err + program.out.decode()
     assert {"minilamp-001", "benjr-001", "minilamp-002"} <= {one.topic.split("/")[2] for one in operator.seen}
     assert "Traceback" not in program.err
@@ -394,7 +391,7 @@ class Hall:
     def send(self, body: Any, **options: Any) -> None:
         """Publish a drive command to each robot, and wait until the broker has it."""
         for info in [self.operator.send(f"{kind}/incoming/drive-values", body, **options) for kind in KINDS]:
-            info.wait_for_publish(5)
+            info.wait_for_publish(WAIT_S)
 
     def heartbeats(self, kind: str, since: float) -> list[dict[str, Any]]:
         beats = [one.json for one in self.operator.on(f"{kind}/outgoing/online", since) if not one.retain]
@@ -440,7 +437,8 @@ def test_nothing_hostile_moves_a_robot_or_stops_its_heartbeat(hall: Hall) -> Non
 
 
 @pytest.mark.parametrize("fault", ["black hole", "broker killed"])
-def test_motors_are_off_within_a_second_and_no_retained_command_moves_them_afterwards(hall: Hall, fault: str) -> None:
+def test_motors_stop_by_themselves_and_no_retained_command_moves_them_afterwards(hall: Hall, fault: str) -> None:
+    """After a second, which test_deadman_virtual measures."""
     begin, end = {
         "black hole": (hall.link.blackhole, hall.link.resume),
         "broker killed": (hall.broker.kill, hall.broker.start),
@@ -448,9 +446,9 @@ def test_motors_are_off_within_a_second_and_no_retained_command_moves_them_after
     last = hall.drive()
     assert until(hall.moving)
     begin()
-    assert until(hall.resting, 3.0)
+    assert until(hall.resting)
     for kind in KINDS:
-        assert hall.robots.stopped_at(kind) - last <= LIMIT_S, kind
+        assert hall.robots.stopped_at(kind) - last < SOON_S, kind
     assert until(lambda: not any(robot.online for robot in hall.robots.robots.values()))
     end()
     moves = {kind: len(moves) for kind, moves in hall.robots.moves.items()}

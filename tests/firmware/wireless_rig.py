@@ -12,9 +12,7 @@ from pebble.contract.identity import Identity
 from pebble.extensions.lab.simulation.fleet import Fleet
 from pebble.extensions.lab.simulation.wireless import KINDS, WirelessRobot
 from pebble.transports import MqttSettings
-from tests.support import until
-
-START_S = 10.0
+from tests.support import WAIT_S, until
 
 
 class Robots:
@@ -37,10 +35,10 @@ class Robots:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self._ending.set()
-        self._thread.join(10)
+        self._thread.join(WAIT_S)
         self.fleet.close()
 
-    def wait_online(self, timeout: float = START_S) -> None:
+    def wait_online(self, timeout: float = WAIT_S) -> None:
         online = until(lambda: all(robot.online for robot in self.robots.values()), timeout)
         assert online, {kind: robot.problem for kind, robot in self.robots.items()}
 

@@ -20,6 +20,7 @@ from pebble.forwarding.admission import MAX_ACTIONS, MAX_UNKNOWN_COMMANDS, MAX_U
 from pebble.forwarding.event_buffer import RESEND_S, EventBuffer
 from pebble.forwarding.forwarder import Forwarder
 from pebble.forwarding.loopback_filter import EXPIRY_S, LoopbackFilter
+from pebble.forwarding.probes import Probes
 from pebble.forwarding.reconciliation import Reconciliation, Resolution
 from pebble.forwarding.routing import MIRROR, TABLE_A1, Drop, Forward, Rules, Side
 from pebble.forwarding.subjects import Subjects
@@ -79,7 +80,18 @@ class TestLoopbackFilter:
             loopback.is_echo(f"flag{number}", b"1")
             for number in range(loopback_filter.TOPICS, 2 * loopback_filter.TOPICS)
         )
+        loopback.expect("t", b"1")
+        loopback.forget("t")
         assert len(loopback) == 0
+        for _ in range(loopback_filter.MESSAGES):  # what has come back does not count
+            loopback.expect("t", b"1")
+            assert loopback.is_echo("t", b"1")
+
+
+def test_a_copied_probe_counts_once() -> None:
+    probes = Probes()
+    assert [probes.announce(b"1"), probes.see(b"1"), probes.see(b"1")] == [False, True, False]
+    assert [probes.see(b"2"), probes.announce(b"2"), probes.announce(b"2")] == [False, True, False]
 
 
 class TestAdmission:

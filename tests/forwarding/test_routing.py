@@ -162,6 +162,7 @@ class TestRenamedTopics:
 
 def test_filters_never_overlap_and_memory_of_strangers_is_bounded() -> None:
     assert SUBJECTS.filters(INCOMING) == [f"{BASE}/incoming/#"]
+    assert all(topic.startswith(f"{BASE}/incoming/flags/") for topic in SUBJECTS.flags)
     assert SUBJECTS.filters(INCOMING, OUTGOING) == [f"{BASE}/incoming/#", f"{BASE}/outgoing/#"]
     subjects = Subjects(config_with("services.mqtt_bridge.topics.reboot", f"{BASE}/incoming/again"))
     assert subjects.filters(INCOMING) == [f"{BASE}/incoming/#"]

@@ -22,7 +22,7 @@ from pebble.runtime.process import view_of
 from tests.ext.boards import mcu_wire as wire
 from tests.ext.boards.mcu_wire import M, Received
 from tests.kit.robot import ROBOT, Listener, LocalNetwork, Running
-from tests.support import until
+from tests.support import WAIT_S, until
 
 _numbers = count()
 STEP_S = 0.002
@@ -105,7 +105,7 @@ class ScriptedMcu:
 
     def close(self) -> None:
         self._ending = True
-        self._thread.join(5)
+        self._thread.join(WAIT_S)
         if self._master >= 0:
             self.unplug()
 
@@ -223,7 +223,7 @@ class SerialRig:
         if not until(lambda: service.aliases.permitted, 5):  # type: ignore[attr-defined]
             return False
         service.post(done.set)  # the subscriptions are made by the job that permits
-        return done.wait(5)
+        return done.wait(WAIT_S)
 
     def close(self) -> None:
         self._ends.close()

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support import ROOT, until
+from tests.support import ROOT, WAIT_S, until
 
 START_S = 40.0
 MARK = "PEBBLE_TEST_DEMO"
@@ -50,7 +50,7 @@ class Demo:
     def end(self) -> None:
         if self.process.poll() is None:
             self.process.kill()
-            self.process.wait(10)
+            self.process.wait(WAIT_S)
 
 
 def _pids() -> list[str]:

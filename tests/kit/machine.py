@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
-from tests.support import Child, until
+from tests.support import WAIT_S, Child, until
 
 SYSTEMD = Path("/usr/lib/systemd/systemd")
 #: What this machine has, and a robot's would not: they are empty there.
@@ -147,7 +147,7 @@ class Machine:
         command = ["sh", "-c", enter, "boot", *unshare, "sh", "-c", BOOT, "boot", str(self.folder), self._like, shared]
         with (self.folder / "boot.log").open("ab") as log:
             self._boot = Child(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
-        assert until(self._found, 30), f"no machine:\n{(self.folder / 'boot.log').read_text()}"
+        assert until(self._found), f"no machine:\n{(self.folder / 'boot.log').read_text()}"
         assert until(lambda: self.run("systemctl", "is-system-running", check=False).strip() in _UP, 90, step=0.2), (
             self.run("systemctl", "list-jobs", check=False) + self.run("systemctl", "--failed", check=False)
         )
@@ -172,10 +172,10 @@ class Machine:
                     os.kill(self._init, signal.SIGKILL)
             else:
                 self._boot.kill()
-            self._boot.wait(30)
+            self._boot.wait(WAIT_S)
             self._boot, self._init = None, 0
         for folder, _, _ in os.walk(self._cgroup, topdown=False):
-            assert until(partial(_removed, Path(folder)), 10), folder
+            assert until(partial(_removed, Path(folder))), folder
 
     @property
     def root(self) -> Path:

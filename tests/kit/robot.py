@@ -28,7 +28,7 @@ from pebble.runtime.connections import local_transport
 from pebble.service import Service
 from pebble.transports import Message, MqttSettings, QoS, State, Transport, ZenohSettings, create
 from pebble.transports.memory import MemoryHub, MemoryTransport
-from tests.support import Broker, until
+from tests.support import WAIT_S, Broker, until
 from tests.transports.forked import Forked
 from tests.transports.zenoh_net import HubProcess
 
@@ -44,7 +44,7 @@ class Listener:
         self.received: list[Message] = []
         self.at: list[float] = []
         self.base = base
-        self.transport = transport.open(10)
+        self.transport = transport.open(WAIT_S)
         assert transport.state is State.CONNECTED, transport.problem
         transport.subscribe(f"{base}/outgoing/#", self._receive, direct=True)
 
@@ -62,21 +62,21 @@ class Listener:
         """Return the newest value on a topic; an empty dict if there is none, or it was cleared."""
         return next((msgspec.json.decode(raw) for raw in self.newest_raw(metric)), {})
 
-    def became(self, metric: str, timeout: float = 15.0, **fields: Any) -> bool:
+    def became(self, metric: str, timeout: float = WAIT_S, **fields: Any) -> bool:
         """Wait until the newest message on a topic has these fields; return whether it has."""
         return until(lambda: fields.items() <= self.newest(metric).items(), timeout)
 
     def described(self, uid: str | bytes) -> None:
         """Wait for this MCU's manifest."""
-        assert until(lambda: self.newest_raw(f"mcu/{uid!s}/describe"), 5), uid
+        assert until(lambda: self.newest_raw(f"mcu/{uid!s}/describe")), uid
 
     def got(self, metric: str) -> bool:
         """Wait for a payload on this topic; return whether it has come."""
-        return until(lambda: self.payloads(metric), 5)
+        return until(lambda: self.payloads(metric))
 
-    def cleared(self, *metrics: str, timeout: float = 3.0) -> bool:
+    def cleared(self, *metrics: str) -> bool:
         """Wait until the newest message on each topic is empty. Also True if there was none: wait for a value first."""
-        return until(lambda: not any(self.newest_raw(metric) for metric in metrics), timeout)
+        return until(lambda: not any(self.newest_raw(metric) for metric in metrics))
 
     def values(self, metric: str) -> list[Any]:
         """Return the ``value`` of each payload on this topic."""
@@ -160,7 +160,7 @@ class Running:
 
     def stop(self) -> None:
         self.service.quit()
-        self._thread.join(10)
+        self._thread.join(WAIT_S)
         assert not self._thread.is_alive(), "the service does not end"
 
 

@@ -8,7 +8,7 @@ import sys
 import threading
 from collections.abc import Iterable
 
-from tests.support import Child
+from tests.support import WAIT_S, Child
 
 _PULSE = """
 import os, sys, time
@@ -51,7 +51,7 @@ class Stalls:
     def close(self) -> None:
         for process in self._processes:
             process.kill()
-            process.wait(10)
+            process.wait(WAIT_S)
 
     @property
     def found(self) -> list[Stall]:

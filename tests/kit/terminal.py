@@ -10,7 +10,7 @@ import termios
 import threading
 from pathlib import Path
 
-from tests.support import ROOT, until
+from tests.support import ROOT, WAIT_S, until
 
 SHELL = {"PS1": "$ ", "TERM": "xterm", "COLUMNS": "200", "HISTFILE": "/dev/null"}
 
@@ -37,7 +37,7 @@ class Terminal:
         self.hang_up()
         if self.process.poll() is None:
             self.process.kill()
-        self.process.wait(10)
+        self.process.wait(WAIT_S)
 
     def hang_up(self) -> None:
         """Close the terminal, as its window does."""
@@ -73,7 +73,7 @@ class Terminal:
 
     # -- what is shown
 
-    def sees(self, text: str, timeout: float = 15.0) -> bool:
+    def sees(self, text: str, timeout: float = WAIT_S) -> bool:
         return until(lambda: text in self.shown, timeout)
 
     def shows(self, prompt: str, timeout_s: float = 60.0) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from pebble.extension import Stage
-from tests.support import ROOT, gone, process_name, until
+from tests.support import ROOT, WAIT_S, gone, process_name, until
 
 BASE = "pebble/robots/rover"
 FAKES = ROOT / "tests" / "fakes"
@@ -52,7 +52,7 @@ class Robot:
 
     def stop(self) -> int:
         self.process.send_signal(signal.SIGTERM)
-        return self.process.wait(20)
+        return self.process.wait(WAIT_S)
 
     def order(self, asker: str, *orders: str) -> None:
         """Have an ``asker`` that is ready request a program: ``media 1``."""
@@ -92,7 +92,7 @@ class Robot:
         return statuses[-1]["payload"]["value"]["services"] if statuses else {}
 
     def ready(self, *names: str) -> bool:
-        return until(lambda: all(self.states().get(name) == "ready" for name in names), 20)
+        return until(lambda: all(self.states().get(name) == "ready" for name in names))
 
     def logs(self) -> list[Any]:
         return [line["payload"] for line in self.published("logs")]
@@ -132,6 +132,6 @@ def launch(tmp_path: Path) -> Iterator[Launch]:
     yield make
     for robot in robots:
         robot.process.kill()  # the children notice by themselves
-        robot.process.wait(10)
+        robot.process.wait(WAIT_S)
         left = robot.end_leftovers()
         assert not left, f"processes that outlived their launcher: {left}"

@@ -22,7 +22,7 @@ from pebble.runtime.parent import Notifier
 from pebble.transports import Message, QoS, State
 from tests.fakes.recording_transport import RecordingTransport
 from tests.launcher.conftest import lines_of
-from tests.support import until
+from tests.support import WAIT_S, until
 
 
 class ConnectedAnnouncer:
@@ -50,7 +50,7 @@ class ConnectedAnnouncer:
         return [line["payload"]["t"] for line in parsed if line["topic"] == topic]
 
     def join(self) -> None:
-        self._thread.join(10)
+        self._thread.join(WAIT_S)
         assert not self._thread.is_alive()
 
     def close(self) -> None:

@@ -312,6 +312,7 @@ def test_reports_of_a_process_end_with_it() -> None:
     for note in WELL.values():
         robot.receive(*note)
     assert robot.mcus == {"serial": {"state": "ready", "heard_ms": 0}}
+    assert robot.changes == len(WELL), "each is published"
     robot.ended(OWNER)
     assert robot.mcus == {}
     assert robot.shows() == "unknown serial_mcu_bridge has just started"

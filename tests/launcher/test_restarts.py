@@ -177,9 +177,10 @@ def test_the_watchdog_is_served_at_half_its_time(environment: dict[str, str], pe
 def test_the_folder_is_for_this_user_alone(tmp_path: Path, mode: int | None) -> None:
     run = tmp_path / "a" / "b"
     if mode is not None:
-        run.mkdir(mode, parents=True)
+        run.parent.mkdir(0o700)
+        run.mkdir(mode)
     with RunLock(run, "x/y/z", tmp_path / "state.lock") as lock:
-        assert run.stat().st_mode & 0o777 == 0o700
+        assert [folder.stat().st_mode & 0o777 for folder in (run, run.parent)] == [0o700] * 2
         assert lock.path.read_text() == f"{os.getpid()}\nx/y/z\n"
 
 
@@ -257,7 +258,7 @@ def media(behaviour: str, name: str = "media", **more: Any) -> Row:
 
 
 def started(robot: Robot, name: str, times: int = 1) -> bool:
-    return until(lambda: len(robot.events(name, "start")) == times, 20)
+    return until(lambda: len(robot.events(name, "start")) == times)
 
 
 def state_of(robot: Robot, name: str = "media") -> Any:
@@ -328,7 +329,7 @@ def test_a_released_program_that_does_not_stop_is_killed_without_a_wait_and_star
     robot.order("bridge", "media 0", "media 1")
     assert until(lambda: "media is released" in robot.stderr())
     os.kill(robot.events("serial", "start")[0], signal.SIGKILL)
-    assert until(lambda: len(robot.events("serial", "ready")) == 2, 20)
+    assert until(lambda: len(robot.events("serial", "ready")) == 2)
     assert not gone(stubborn), "the other one was back before this one had to end"
     assert started(robot, "media", 2)
     assert gone(stubborn)
@@ -356,10 +357,10 @@ def test_the_successor_of_a_bridge_that_dies_gets_the_requests_and_those_it_repe
     robot.order("bridge", "media 1", "other 1")
     assert robot.ready("media", "other")
     os.kill(robot.events("bridge", "start")[0], signal.SIGKILL)
-    assert until(lambda: len(robot.events("bridge", "ready")) == 2, 20)
+    assert until(lambda: len(robot.events("bridge", "ready")) == 2)
     assert robot.events("bridge", "before:media=,other=")
     robot.order("bridge", "media 1")
-    assert until(lambda: robot.events("other", "stop"), 20), "expired: the request was not repeated"
+    assert until(lambda: robot.events("other", "stop")), "expired: the request was not repeated"
     assert "other: the program that requested it has ended, and the request was not repeated" in robot.stderr()
     assert until(lambda: state_of(robot, "other") == "stopped")
     assert robot.states()["media"] == "ready"

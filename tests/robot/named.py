@@ -83,9 +83,9 @@ class Named(Rig):
         """Publish under one's own name."""
         self.person(name).send(f"incoming/by/{name}/{metric}", body, **options)
 
-    def sends(self, name: str, metric: str, body: Any, has_effect: Callable[[], object], timeout: float = 10) -> bool:
+    def sends(self, name: str, metric: str, body: Any, has_effect: Callable[[], object]) -> bool:
         """Publish again and again until it has its effect: what a busy machine holds up is dropped as too late."""
-        return until(lambda: has_effect() or self.send(name, metric, body) or has_effect(), timeout, step=0.2)
+        return until(lambda: has_effect() or self.send(name, metric, body) or has_effect(), step=0.2)
 
     def state(self) -> dict[str, Any]:
         return self.operator.newest(STATE)

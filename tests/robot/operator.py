@@ -14,7 +14,7 @@ from typing import Any
 import paho.mqtt.client as paho
 from paho.mqtt.enums import CallbackAPIVersion
 
-from tests.support import until
+from tests.support import WAIT_S, until
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Operator:
         self._client.reconnect_delay_set(min_delay=1, max_delay=1)
         self._client.connect("127.0.0.1", port, keepalive=5)
         self._client.loop_start()
-        assert until(self._client.is_connected, 10)
+        assert until(self._client.is_connected)
 
     def close(self) -> None:
         self._client.disconnect()
@@ -92,7 +92,7 @@ class Operator:
         seen = self.last(f"outgoing/{metric}")
         return {} if seen is None or not seen.payload else dict(seen.json)
 
-    def wait_for(self, suffix: str, timeout: float = 10.0, since: float = 0.0) -> ReceivedMessage:
+    def wait_for(self, suffix: str, timeout: float = WAIT_S, since: float = 0.0) -> ReceivedMessage:
         """The first message on a topic after ``since``; fails when none comes in time."""
         assert until(lambda: self.on(suffix, since), timeout), f"nothing on {suffix} within {timeout} s"
         return self.on(suffix, since)[0]

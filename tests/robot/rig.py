@@ -20,7 +20,7 @@ from pebble.extensions.lab.rig.processes import children
 from pebble.extensions.lab.simulation.trace import Entry, complete_lines
 from tests.kit.stalls import Stall
 from tests.robot.operator import Operator
-from tests.support import ROOT, Broker, process_name, until
+from tests.support import ROOT, WAIT_S, Broker, process_name, until
 from tests.tcp_proxy import TcpProxy
 
 BASE = "pebble/robots/rover"
@@ -95,7 +95,7 @@ class Mcu(Motors):
              "--trace", str(self._trace), "--control"],
             cwd=ROOT, stdin=subprocess.PIPE,
         )  # fmt: skip
-        assert until(self.port.exists, 10), "the simulated MCU did not start"
+        assert until(self.port.exists), "the simulated MCU did not start"
 
     def command(self, name: str) -> None:
         """``unplug``, ``replug``, ``charge``, …"""
@@ -105,7 +105,7 @@ class Mcu(Motors):
 
     def close(self) -> None:
         self._process.terminate()
-        self._process.wait(10)
+        self._process.wait(WAIT_S)
 
 
 class Rig:
@@ -181,7 +181,7 @@ class Rig:
         if ready:
             try:
                 self.wait_until_up(began)
-                assert until(lambda: self._listens_since(logged), 30), (
+                assert until(lambda: self._listens_since(logged)), (
                     f"nothing is forwarded:\n{self.log.read_text()[-4000:]}"
                 )
             except BaseException:
@@ -205,7 +205,7 @@ class Rig:
         assert self._robot is not None
         for number in signals or (signal.SIGTERM,):
             self._robot.send_signal(number)
-        return self._robot.wait(20)
+        return self._robot.wait(WAIT_S)
 
     def ensure_stopped(self) -> None:
         """Stop the robot, if it runs."""
@@ -217,7 +217,7 @@ class Rig:
         assert self._robot is not None
         children = list(self.processes().values())
         self._robot.kill()
-        self._robot.wait(10)
+        self._robot.wait(WAIT_S)
         return children
 
     def processes(self) -> dict[str, int]:
@@ -238,7 +238,7 @@ class Rig:
         os.kill(pid, signal.SIGKILL)
         return time.monotonic()
 
-    def shows_driveable(self, state: str, why: str = "", seconds: float = 20.0) -> bool:
+    def shows_driveable(self, state: str, why: str = "", seconds: float = WAIT_S) -> bool:
         """Wait until the status says so; return whether it does."""
 
         def found() -> bool:

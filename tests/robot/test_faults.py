@@ -29,7 +29,7 @@ def retained_state_is_current_afterwards(driven: Rig) -> Iterator[None]:
     change = not charging["value"]
     driven.charge_later = "charge" if change else "discharge"
     yield
-    assert until(lambda: _retained_is_current(driven, change), 10), retained_messages(driven.remote.port, BASE)
+    assert until(lambda: _retained_is_current(driven, change)), retained_messages(driven.remote.port, BASE)
 
 
 def _retained_is_current(rig: Rig, charging: bool) -> bool:

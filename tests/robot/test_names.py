@@ -54,8 +54,8 @@ def test_only_who_has_control_drives(rig: Named) -> None:
             rig.judged("mia", key, 0.3)
             zeroed = time.monotonic()
             rig.person(name).send(suffix, {"x": 0, "z": 0, **more})
-            assert until(lambda since=zeroed: lines(rig, 0.0, since), 5), (name, suffix)
-            assert until(lambda: not rig.mcu.moving(), 5)
+            assert until(lambda since=zeroed: lines(rig, 0.0, since)), (name, suffix)
+            assert until(lambda: not rig.mcu.moving())
     assert [z for z in (0.12, 0.13, 0.14, 0.15, 0.16, 0.17, 0.19) if lines(rig, z)] == []
     assert rig.operator.newest("capabilities")["value"]["named"] is True
 
@@ -63,10 +63,10 @@ def test_only_who_has_control_drives(rig: Named) -> None:
 def test_everybody_stops_it_and_only_a_safety_officer_resets_it(rig: Named) -> None:
     with rig.held("otto") as key, driving(_By(rig, "otto"), 0.7, key=key):
         for suffix, by in (("incoming/by/vera/estop", "vera"), ("incoming/estop", "somebody?")):
-            assert until(lambda: rig.mcu.moving(), 5)
+            assert until(lambda: rig.mcu.moving())
             rig.person("vera").send(suffix, {"stop": f"{len(suffix):016x}", "by": by})
-            assert until(lambda: not rig.mcu.moving(), 5)
-            assert until(lambda: state_of(rig)["latched"], 5)
+            assert until(lambda: not rig.mcu.moving())
+            assert until(lambda: state_of(rig)["latched"])
             stopped = state_of(rig)
             assert stopped["by"].split("/")[0] == by  # with a mark where it was not checked
             reset = {one: stopped[one] for one in ("boot", "count")}
@@ -85,13 +85,13 @@ def test_who_is_removed_while_driving_stands(rig: Named) -> None:
     with ExitStack() as ends:
         key = ends.enter_context(rig.held("zoe", for_ms=2000))
         ends.enter_context(driving(_By(rig, "zoe"), 0.8, key=key))
-        assert until(lambda: lines(rig, 0.8), 5)
+        assert until(lambda: lines(rig, 0.8))
         removed = time.monotonic()
         rig.hall.remove("zoe")
-        assert until(lambda: not rig.mcu.moving(), 5)
+        assert until(lambda: not rig.mcu.moving())
         stood = next(at for at, wheels in rig.mcu.drives(removed) if wheels == STOP)
         assert stood - removed < 4, "a second, on a machine that has nothing else to do"
-    assert until(lambda: rig.state()["key"] == "", 15)
+    assert until(lambda: rig.state()["key"] == "")
 
 
 class _By:
@@ -110,12 +110,12 @@ def test_what_another_account_sends_holds_up_no_stop(tmp_path: Path) -> None:
     The robot is one of its own: what is left of a flood takes its time.
     """
     with Hall(tmp_path / "hall") as hall, Named("zenoh", hall, {"level": "named"}) as rig:
-        assert until(lambda: "have a connection of their own" in rig.log.read_text(), 10)
+        assert until(lambda: "have a connection of their own" in rig.log.read_text())
         ending, sent, took = threading.Event(), itertools.count(), list[float]()
 
         def flood() -> None:
             place = Place(HOST, rig.remote.port, None)
-            with BrokerClient(place, "vera", rig.hall.passwords["vera"], timeout_s=30) as vera:
+            with BrokerClient(place, "vera", rig.hall.passwords["vera"]) as vera:
                 while not ending.is_set():
                     vera.publish(f"{BASE}/incoming/by/vera/front-camera", b"[" * 60_000)
                     next(sent)
@@ -123,11 +123,11 @@ def test_what_another_account_sends_holds_up_no_stop(tmp_path: Path) -> None:
         with beside(flood, ending):
             began = time.monotonic()
             while len(took) < 3 or time.monotonic() < began + FLOOD_S:
-                assert until(lambda: next(sent) > 100, 10)
+                assert until(lambda: next(sent) > 100)
                 name, pressed = f"f{len(took):015x}", time.monotonic()
                 rig.person("mia").send("incoming/estop", {"stop": name})  # once
-                assert until(lambda n=name: n in state_of(rig).get("recent", []), 10), took
+                assert until(lambda n=name: n in state_of(rig).get("recent", [])), took
                 took.append(time.monotonic() - pressed)
-        assert statistics.median(took) < 1, took
+        assert statistics.median(took) < 3, took
         order = {one: state_of(rig)[one] for one in ("boot", "count")}
-        assert rig.sends("boss", "estop-reset", order, lambda: not state_of(rig)["latched"], 30), state_of(rig)
+        assert rig.sends("boss", "estop-reset", order, lambda: not state_of(rig)["latched"]), state_of(rig)

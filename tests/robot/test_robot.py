@@ -12,7 +12,7 @@ from tests.commands.command_line import program
 from tests.robot.conftest import Station
 from tests.robot.operator import Operator, driving, retained_messages
 from tests.robot.rig import BASE, STOP, Rig
-from tests.support import further, gone, until
+from tests.support import SOON_S, further, gone, until
 
 pytestmark = pytest.mark.alone  # deadlines are checked
 
@@ -35,7 +35,7 @@ def retain_messages(port: int, messages: dict[str, Any]) -> None:
     publisher = Operator(port, BASE)
     for topic, body in messages.items():
         publisher.send(topic, body, retain=True)
-    assert until(lambda: set(retained_messages(port, BASE, 0.2)) >= set(messages), 5)
+    assert until(lambda: set(retained_messages(port, BASE, 0.2)) >= set(messages))
     publisher.close()
 
 
@@ -56,9 +56,9 @@ def test_what_is_retained_does_nothing_and_a_live_stop_that_asks_to_be_retained_
         if rig.local is not None:
             assert not set(retained_messages(rig.local.port, BASE)) & set(COMMANDS)
         began = time.monotonic()
-        assert until(lambda: _turns(rig, began), 5)
+        assert until(lambda: _turns(rig, began))
         assert not any(seen.json["latched"] or seen.json["count"] for seen in rig.operator.on(state))
-        assert until(lambda: _is_stopped(rig, state), 5, step=0.2)
+        assert until(lambda: _is_stopped(rig, state), step=0.2)
         stopped = time.monotonic()
         assert not until(lambda: _turns(rig, stopped), 1)
 
@@ -102,12 +102,12 @@ def test_a_stop_from_either_side_holds_over_restarts_until_its_reset(kind: str) 
     with Rig(kind) as rig:
         remote = f"--url=mqtt://127.0.0.1:{rig.remote.port}"
         with driving(rig.operator, 0.5):
-            assert until(rig.mcu.moving, 5)
+            assert until(rig.mcu.moving)
             code, printed = pebble("estop", BASE, remote, "--why", "dog")
             stopped = time.monotonic()
             assert (code, "stopped and confirmed after" in printed) == (0, True), printed
             rig.kill("serial_mcu_bridge")
-            assert until(lambda: rig.processes().get("serial_mcu_bridge"), 5)
+            assert until(lambda: rig.processes().get("serial_mcu_bridge"))
             rig.stop()
             rig.start()
             assert {wheels for _, wheels in rig.mcu.drives(stopped)} <= {STOP}
@@ -117,7 +117,7 @@ def test_a_stop_from_either_side_holds_over_restarts_until_its_reset(kind: str) 
         assert code == 0, printed
         rig.operator.send("incoming/drive-values", {"x": 0, "z": 0})  # without it the robot waits for half a second
         with driving(rig.operator, 0.5):
-            assert until(rig.mcu.moving, 5)
+            assert until(rig.mcu.moving)
             code, printed = pebble("estop", rig.config)
             assert code == 0, printed
             assert not rig.mcu.moving()
@@ -133,11 +133,7 @@ def stop_and_wait(station: Station) -> None:
     def stands() -> bool:
         return station.rig.mcu.drives(began) and not station.rig.mcu.moving()
 
-    for _ in range(4):
-        station.operator.send(DRIVE, {"x": 0, "z": 0})
-        if until(stands, 1):
-            return
-    assert stands()
+    assert until(lambda: station.operator.send(DRIVE, {"x": 0, "z": 0}) and until(stands, 1))
 
 
 def first_motion(station: Station, since: float) -> tuple[float, tuple[float, float]]:
@@ -156,7 +152,7 @@ def test_drive_forms_reach_the_wheels(station: Station, body: Any, wheels: tuple
     stop_and_wait(station)
     began = time.monotonic()
     station.operator.send(DRIVE, body)
-    assert until(lambda: station.rig.mcu.moving(began), 3)
+    assert until(lambda: station.rig.mcu.moving(began))
     assert first_motion(station, began)[1] == pytest.approx(wheels)
 
 
@@ -164,11 +160,11 @@ def test_silence_stops_the_wheels(station: Station) -> None:
     stop_and_wait(station)
     began = time.monotonic()
     station.operator.send(DRIVE, {"x": 0.1, "z": 0.3})
-    assert until(lambda: station.rig.mcu.moving(began), 3)
-    assert until(lambda: not station.rig.mcu.moving(began), 3)
+    assert until(lambda: station.rig.mcu.moving(began))
+    assert until(lambda: not station.rig.mcu.moving(began))
     started, _ = first_motion(station, began)
     stopped, _ = next((at, wheels) for at, wheels in station.rig.mcu.drives(started) if wheels == STOP)
-    assert 0.70 <= stopped - started <= 0.85
+    assert 0.70 <= stopped - started < 1.0, "later the MCU stops by itself"
 
 
 def test_actions_run_once_and_only_for_true(station: Station) -> None:
@@ -178,7 +174,7 @@ def test_actions_run_once_and_only_for_true(station: Station) -> None:
     station.operator.send("incoming/flags/reboot", True, retain=True)
     station.operator.send("incoming/flags/reboot", b"", retain=True)
     station.operator.send("incoming/flags/service-restart", {"enabled": True})
-    assert until(lambda: len(station.rig.recorded()) > before, 3)
+    assert until(lambda: len(station.rig.recorded()) > before)
     assert station.rig.recorded()[before:] == ["service_restart"]
 
 
@@ -187,9 +183,9 @@ def test_actions_run_once_and_only_for_true(station: Station) -> None:
 
 def test_four_heartbeats_a_second(uplinked: Station) -> None:
     began = time.monotonic()
-    assert until(lambda: len(uplinked.operator.on("outgoing/online", began)) >= 9, 5)
+    assert until(lambda: len(uplinked.operator.on("outgoing/online", began)) >= 9)
     heartbeats = uplinked.operator.on("outgoing/online", began)[:9]
-    assert 1.5 <= heartbeats[-1].at - heartbeats[0].at <= 3.0
+    assert 1.5 <= heartbeats[-1].at - heartbeats[0].at < SOON_S
     assert abs(heartbeats[-1].json["t"] / 1000 - time.time()) < 3
     assert "outgoing/online" in retained_messages(uplinked.rig.remote.port, BASE)
 
@@ -206,10 +202,10 @@ def test_stopping_the_robot_stops_the_wheels_and_reports_offline(uplinked: Stati
     rig = uplinked.rig
     began = time.monotonic()
     uplinked.operator.send(DRIVE, {"x": 0, "z": 0.5})
-    assert until(lambda: rig.mcu.moving(began), 3)
+    assert until(lambda: rig.mcu.moving(began))
     left_behind = rig.processes()
     assert rig.stop() == 0
     assert rig.mcu.drives(began)[-1][1] == STOP
-    assert until(lambda: (last := uplinked.operator.last("outgoing/online")) and last.json.get("online") is False, 3)
+    assert until(lambda: (last := uplinked.operator.last("outgoing/online")) and last.json.get("online") is False)
     assert all(map(gone, left_behind.values()))
     rig.start()

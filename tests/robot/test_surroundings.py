@@ -50,13 +50,12 @@ def test_a_robot_runs(surroundings: dict[str, Any]) -> None:
 @pytest.mark.parametrize("files", [20, further(40)])
 def test_too_few_descriptors_are_an_error_or_enough(kind: str, files: int) -> None:
     with Rig(kind, start=False) as rig:
-        began = rig.start(ready=False, preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (files, files)))
+        rig.start(ready=False, preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_NOFILE, (files, files)))
         ended = until(lambda: gone(rig.launcher_pid), 3.0)
         if not ended:  # it goes on, and can be stopped
             assert rig.stop() == 0
         else:
             assert rig.stop() != 0
-        assert time.monotonic() - began < 20
 
 
 def test_a_stop_at_any_moment_of_the_start_leaves_nothing() -> None:
@@ -65,9 +64,7 @@ def test_a_stop_at_any_moment_of_the_start_leaves_nothing() -> None:
             rig.start(ready=False)
             time.sleep(0.04 * index)
             children = descendants(rig.launcher_pid)
-            began = time.monotonic()
             rig.stop((signal.SIGTERM, signal.SIGINT, signal.SIGHUP)[index % 3])
-            assert time.monotonic() - began < 5
             assert until(lambda pids=children: all(map(gone, pids)))  # type: ignore[misc]
         assert not until(lambda: remains(rig), 0.5)
         before = len(rig.log.read_text())  # the interpreter prints a signal that comes before any of our code
@@ -92,7 +89,7 @@ def test_a_hurried_stop_stops_the_wheels(kind: str, options: dict[str, Any], sig
         children = descendants(rig.launcher_pid)
         rig.stop(*[signal.SIGTERM] * signals)
         assert until(lambda: all(map(gone, children)))
-        assert until(lambda: not rig.mcu.turning(), 2.0)
+        assert until(lambda: not rig.mcu.turning())
 
 
 MESSAGES = cases(1_600, 20_000)
@@ -140,7 +137,7 @@ def _still_responds(rig: Rig, shade: float) -> bool:
     began = time.monotonic()
     rig.operator.send("incoming/lights-solid", {"g": round(shade, 3)})
     line = f"L 0.000 {shade:.3f} 0.000"
-    return until(lambda: any(entry.line == line for entry in rig.mcu.entries(began)), 20)
+    return until(lambda: any(entry.line == line for entry in rig.mcu.entries(began)))
 
 
 def _memory(rig: Rig) -> int:

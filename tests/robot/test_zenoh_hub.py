@@ -22,7 +22,7 @@ from tests.ext.fleet.test_attempts import GOOB
 from tests.ext.fleet.test_zenoh import Hall
 from tests.robot.operator import ReceivedMessage
 from tests.robot.rig import Rig
-from tests.support import beside, cases, further, until
+from tests.support import WAIT_S, beside, cases, further, until
 
 pytestmark = pytest.mark.alone  # stops are timed
 
@@ -34,7 +34,7 @@ class Watcher:
 
     def __init__(self, settings: ZenohSettings) -> None:
         self.newest: dict[str, ReceivedMessage] = {}
-        self._client = create("zenoh", "watcher", settings).open(10)
+        self._client = create("zenoh", "watcher", settings).open(WAIT_S)
         self._client.subscribe(f"{GOOB}/outgoing/#", self._receive, direct=True)
         self.close = self._client.close
 
@@ -58,7 +58,7 @@ def at_the_operators_hub(hall: Hall) -> Iterator[Rig]:
             raw = json.loads(rig.config.read_text()) | {"security": {"level": "named", "strangers": "free"}}
             raw["services"]["mqtt_bridge"] = {"enabled": True, "remote": remote, "link": {"groups": True}}
             started(rig, raw)
-            assert until(lambda: "have a connection of their own" in rig.log.read_text(), 20)
+            assert until(lambda: "have a connection of their own" in rig.log.read_text())
             yield rig
 
 
@@ -85,13 +85,16 @@ def started(rig: Rig, raw: dict[str, Any]) -> None:
 
 def test_a_group_of_commands_passes_over_zenoh(tmp_path: Path) -> None:
     hall, group = Hall(tmp_path / "hall", "named"), {"drive-values": {"z": 0.3}, "lights-solid": {"g": 1}}
-    with at_the_operators_hub(hall) as rig, closing(create("zenoh", "otto", hall.settings("otto")).open(10)) as otto:
+    with (
+        at_the_operators_hub(hall) as rig,
+        closing(create("zenoh", "otto", hall.settings("otto")).open(WAIT_S)) as otto,
+    ):
 
         def turns() -> bool:
             otto.publish(f"{GOOB}/incoming/by/otto/group", json.dumps(group).encode(), qos=QoS.DELIVERED)
             return until(rig.mcu.turning, 0.3)
 
-        assert until(turns, 20)
+        assert until(turns)
         lines = [entry.line for entry in rig.mcu.entries() if entry.event == "line"]
         assert "M 0.300 0.300, L 0.000 1.000 0.000" in ", ".join(lines), "one write"
 
@@ -112,12 +115,12 @@ class Program:
     def drive(self, stop: str) -> None:
         """Reset the stop of before, if there was one, and turn the wheels."""
         self._z = 0.0
-        assert until(lambda: stop in ("", *self._state.get("recent", [])), 10), self._state
-        assert until(self._is_reset, 10, step=0.05)
+        assert until(lambda: stop in ("", *self._state.get("recent", []))), self._state
+        assert until(self._is_reset, step=0.05)
         enough = self._commands + 2
         assert until(lambda: self._commands >= enough)  # after a reset nothing drives before a zero
         self._z = 0.3
-        assert until(self._rig.mcu.turning, 10)
+        assert until(self._rig.mcu.turning)
 
     def _is_reset(self) -> bool:
         if self._state["latched"]:
@@ -155,10 +158,10 @@ def test_small_messages_of_another_account_hold_up_no_stop(
     by = "by/sam/" if level == "named" else ""
     with ExitStack() as opened:
         rig = opened.enter_context(where(hall))
-        sam = opened.enter_context(closing(create("zenoh", "sam", hall.settings("sam")).open(10)))
+        sam = opened.enter_context(closing(create("zenoh", "sam", hall.settings("sam")).open(WAIT_S)))
         program = Program(rig, opened)
         opened.enter_context(hall.account(floods, topics=[f"{GOOB}/incoming/{metric}"], flood="messages"))
-        assert until(lambda: "front-camera" in rig.log.read_text() or not metric.endswith("camera"), 10)
+        assert until(lambda: "front-camera" in rig.log.read_text() or not metric.endswith("camera"))
         name = ""
         for number in range(cases(3, 20)):
             program.drive(name)
@@ -166,6 +169,6 @@ def test_small_messages_of_another_account_hold_up_no_stop(
             sam.publish(
                 f"{GOOB}/incoming/{by}estop", json.dumps({"stop": name}).encode(), qos=QoS.DELIVERED, urgent=True
             )
-            assert until(lambda: not rig.mcu.turning(), 20), took
+            assert until(lambda: not rig.mcu.turning()), took
             took.append(time.monotonic() - pressed)
     assert statistics.median(took) < 3, took

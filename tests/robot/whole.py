@@ -27,7 +27,7 @@ from tests.kit.stalls import Stalls, lost_s
 from tests.robot.operator import Operator, ReceivedMessage
 from tests.robot.rig import BASE, Rig, descendants, restore, saved_by
 from tests.robot.whole_rules import Alive, History, Seen, by_script
-from tests.support import Broker, gone, until
+from tests.support import WAIT_S, Broker, gone, until
 
 STATE, STOPPED = "outgoing/control/serial", "outgoing/estop/serial"
 SPEEDS = {"ann": 0.3, "otto": 0.5}
@@ -36,8 +36,6 @@ _STOP_TIMEOUT_S = 1.5
 _PERIOD_S = 0.06
 _ANSWER_S = 0.5
 _HOLD_S = 2.2  # a person's command holds a script
-_GONE_S = _STOP_TIMEOUT_S + 3.0
-_CONFIRMED_S = 15.0  # after all faults; a killed robot takes some seconds to start
 #: Faults of what the watcher hears the robot through.
 _DEAFENING = ("kill mqtt_mirror", "freeze mqtt_mirror", "kill zenoh_hub", "freeze zenoh_hub", "a broker is away")
 _WAITS_S = (0.02, 0.05, 0.1, 0.1, 0.2, 0.3, 0.5, 1.0)
@@ -146,7 +144,7 @@ class World:
             self.people = [opened.enter_context(closing(person)) for person in people]
             local = (self.rig.local or self.rig.remote).port
             self.watcher = opened.enter_context(closing(Operator(local, BASE, "outgoing/+/serial")))
-            assert until(lambda: self.watcher.last(STATE) is not None, 15), "nothing is mirrored"
+            assert until(lambda: self.watcher.last(STATE) is not None), "nothing is mirrored"
             self.alive = opened.enter_context(closing(Alive(self.rig.folder)))
             self._stalls = opened.enter_context(closing(Stalls()))
             self._timers: list[threading.Timer] = []
@@ -338,11 +336,11 @@ class World:
         operator = self.rig.operator
         if self.rig.local is None:
             return  # its programs are not away from their own
-        if not until(lambda: operator.is_connected, 5.0):
+        if not until(lambda: operator.is_connected):
             return  # what it sent would arrive later, live
         with self._fault("the uplink is cut for a retained stop", 1.0), self._away():
             name = new_name()
-            operator.send("incoming/estop", {"stop": name, "by": "old"}, retain=True).wait_for_publish(5.0)
+            operator.send("incoming/estop", {"stop": name, "by": "old"}, retain=True).wait_for_publish(WAIT_S)
             self._planted.add(name)
             time.sleep(0.1 + _WAITS_S[b % 8])
 
@@ -389,17 +387,17 @@ class World:
             person.wants = person.drives = False
         for timer in self._timers:
             timer.join()
-        if not until(self._up, 20.0):
+        if not until(self._up):
             return ["the robot does not come back"]
-        if not until(lambda: all(stop.confirmed for person in self.people for stop in person.stops), _CONFIRMED_S):
+        if not until(lambda: all(stop.confirmed for person in self.people for stop in person.stops)):
             why = [robot.why for person in self.people for stop in person.stops for robot in stop.robots.values()]
             return [f"a stop is not confirmed: {why}"]
         for person in self.people:
             person.stops = []
-        if not until(self._ended, _GONE_S, step=0.5):
+        if not until(self._ended, step=0.5):
             return ["a script does not end"]
         time.sleep(_ANSWER_S)  # the state after the last stop may still be on its way
-        if not until(self._is_reset, 10.0, step=0.4):
+        if not until(self._is_reset, step=0.4):
             return ["a stop cannot be reset"]
         for person in self.people:
             if problem := self._drives(person):
@@ -407,7 +405,7 @@ class World:
             person.request(want="release")
         zero = time.monotonic()
         self.do_let_go(self.people[0], 0)
-        if not until(lambda: self.rig.mcu.drives(zero) and not self.rig.mcu.moving(zero), 2.0):
+        if not until(lambda: self.rig.mcu.drives(zero) and not self.rig.mcu.moving(zero)):
             return ["a zero does not stop the wheels"]
         time.sleep(_HOLD_S)
         return self._use_script(self.people[0])
@@ -418,7 +416,7 @@ class World:
         ``zero``: after a reset one lets go first; while a script drives, that would end it.
         """
         person.request("control/take")
-        if not until(person.has_control, 15.0):
+        if not until(person.has_control):
             return f"{person.name} does not get control"
         if zero:
             person.drive(0)
@@ -426,7 +424,7 @@ class World:
         began, wheels = time.monotonic(), (SPEEDS[person.name],) * 2
         for one in self.people:
             one.drives = True
-        obeyed = until(lambda: wheels in [driven for _, driven in self.rig.mcu.drives(began)], 5.0)
+        obeyed = until(lambda: wheels in [driven for _, driven in self.rig.mcu.drives(began)])
         for one in self.people:
             one.drives = False
         return "" if obeyed else f"{person.name} has control, and the wheels do not obey"
@@ -444,15 +442,15 @@ class World:
         released = time.monotonic()
         person.drive(0)  # with its key: any other zero ends the script
         person.request(want="release")
-        if not until(lambda: self._script_moves(released), _HOLD_S + 2.0):
+        if not until(lambda: self._script_moves(released)):
             return ["a script does not go on after a person has let go"]
         stopped = time.monotonic()
         self.do_let_go(person, 0)
-        if not until(lambda: self.rig.mcu.drives(stopped) and not self.rig.mcu.moving(stopped), 2.0):
+        if not until(lambda: self.rig.mcu.drives(stopped) and not self.rig.mcu.moving(stopped)):
             return ["the wheels are not at rest after a person's stop"]
-        if not until(lambda: not self.alive.groups, _GONE_S):
+        if not until(lambda: not self.alive.groups):
             return ["a script that a person has stopped does not end"]
-        shown = until(lambda: self.rig.script().get("error") == "stopped by an operator", 2.0)
+        shown = until(lambda: self.rig.script().get("error") == "stopped by an operator")
         return [] if shown else [f"the status does not say why the script has ended: {self.rig.script()}"]
 
     def _script_moves(self, since: float) -> bool:

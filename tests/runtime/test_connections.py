@@ -37,7 +37,7 @@ from pebble.transports.zenoh.hub.journal import Journal
 from pebble.transports.zenoh.hub.records import StoredWill
 from pebble.transports.zenoh.wire import Will
 from tests.sparing_broker import SparingBroker
-from tests.support import ROOT, Broker, Child, refused, until
+from tests.support import ROOT, WAIT_S, Broker, Child, refused, until
 from tests.transports.zenoh_net import HubProcess
 
 BASE = "pebble/robots/goob"
@@ -195,7 +195,7 @@ def die(settings: ZenohSettings, *topics: str) -> None:
     assert victim.stdout is not None
     assert victim.stdout.readline().count("CONNECTED") == len(topics), "a hello succeeds, whatever the will"
     victim.kill()
-    victim.wait(10)
+    victim.wait(WAIT_S)
     victim.stdout.close()
 
 

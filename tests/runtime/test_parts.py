@@ -19,7 +19,7 @@ from pebble.runtime.source_check import SourceCheck
 from pebble.runtime.timers import Timers
 from pebble.runtime.work_lock import WorkLock
 from pebble.services.serial_mcu_bridge.moving_sensors import MovingSensors
-from tests.support import cases, until
+from tests.support import WAIT_S, cases, until
 
 
 def drain(inbox: Inbox) -> None:
@@ -166,7 +166,7 @@ def test_no_other_thread_enters_before_the_own_one_that_waits() -> None:
 
     def work() -> None:
         with lock:
-            ends.wait(10)
+            ends.wait(WAIT_S)
 
     assert lock.try_enter()
     own = threading.Thread(target=work, daemon=True)
@@ -177,7 +177,7 @@ def test_no_other_thread_enters_before_the_own_one_that_waits() -> None:
         assert not any(lock.try_enter() for _ in range(1000))
     finally:
         ends.set()
-        own.join(10)
+        own.join(WAIT_S)
     assert lock.try_enter()
 
 

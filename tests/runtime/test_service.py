@@ -34,7 +34,7 @@ from pebble.contract.payloads import (
 from pebble.service import Service, every, on
 from pebble.transports import Message, QoS, State, Subscription, clock
 from pebble.transports.memory import MemoryHub, MemoryTransport
-from tests.support import until
+from tests.support import WAIT_S, until
 
 BASE = "pebble/robots/rover"
 SOUND = f"{BASE}/incoming/soundboard-command"
@@ -91,7 +91,7 @@ class Recorder(Service):
     def note(self, value: Any) -> None:
         self.seen.append(value)
         self.threads.add(threading.get_ident())
-        self.go_on.wait(10)
+        self.go_on.wait(WAIT_S)
 
 
 class Robot:
@@ -120,7 +120,7 @@ class Robot:
         self.operator.open()
         self.operator.subscribe(f"{BASE}/outgoing/#", self.received.append)
         self._thread.start()
-        assert self._ready.wait(10)
+        assert self._ready.wait(WAIT_S)
         assert until(lambda: self.service.transport.state is State.CONNECTED)
 
     def publish(self, topic: str, payload: str, *, retain: bool = False) -> None:
@@ -153,7 +153,7 @@ class Robot:
         self.service.go_on.set()
         self.service.quit()
         if self._thread.ident is not None:
-            self._thread.join(10)
+            self._thread.join(WAIT_S)
             assert not self._thread.is_alive()
 
     def close(self) -> None:
@@ -283,7 +283,7 @@ def idle() -> Iterator[Robot]:
     made.start()
     worked = threading.Event()
     made.service.post(worked.set)
-    assert worked.wait(5)
+    assert worked.wait(WAIT_S)
     assert run_when_idle(made.service, lambda: None)  # its turn has ended: it sleeps
     yield made
     made.close()
@@ -308,7 +308,7 @@ def test_a_timer_that_another_thread_sets_wakes_the_services_own(idle: Robot) ->
     assert run_when_idle(
         idle.service, lambda: idle.service.call_at(due, lambda: called.append(threading.get_ident())) and None
     )
-    assert until(lambda: bool(called), 5)
+    assert until(lambda: bool(called))
     assert called[0] != threading.get_ident()
 
 
@@ -462,6 +462,6 @@ def test_a_service_lives_without_a_broker() -> None:
     robot.hub.start()
     assert until(lambda: len(robot.received_on(CHARGING_TOPIC)) > 3), "again and again"
     robot.service.quit()
-    thread.join(10)
+    thread.join(WAIT_S)
     assert not thread.is_alive()
     robot.operator.close()

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 from pebble.extensions.checks.broker.login_attempt import attempt
 from pebble.transports import MqttSettings
-from tests.support import ROOT, Broker, Child, free_port, until
+from tests.support import ROOT, WAIT_S, Broker, Child, free_port, until
 
 ROBOT: Mapping[str, str] = {"username": "robot", "password": "secret"}
 FORBIDDEN = ("touch-sensors", "forbidden")  # metrics below any robot's outgoing/
@@ -143,7 +143,7 @@ class _RabbitMq(_Other):
         super().end(how)
         if self._mapper is not None:
             self._mapper.kill()
-            self._mapper.wait(10)
+            self._mapper.wait(WAIT_S)
             self._mapper = None
 
     @staticmethod

@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 
 from pebble.transports import GROUP, Message, MqttSettings, QoS, State, Transport, create
 from pebble.transports.memory import MemoryHub, MemoryTransport
-from tests.support import ROOT, Broker, until
+from tests.support import ROOT, WAIT_S, Broker, until
 from tests.transports.forked import Forked
 
 
@@ -102,7 +102,7 @@ class Net(ABC):
         client = create(self.kind, name, settings, will=will)
         self._clients.append(client)
         if opened:
-            client.open(10)
+            client.open(WAIT_S)
             assert client.state is State.CONNECTED, client.problem
         return client
 
@@ -128,12 +128,12 @@ class ProcessPeer:
 
     def kill(self) -> None:
         self._process.kill()
-        self._process.wait(10)
+        self._process.wait(WAIT_S)
         self._release()
 
     def close(self) -> None:
         self._ask({"close": True})
-        self._process.wait(10)
+        self._process.wait(WAIT_S)
         self._release()
 
     def _ask(self, request: dict[str, Any]) -> Any:
@@ -143,7 +143,7 @@ class ProcessPeer:
 
     def _answer(self) -> Any:
         line = self._process.stdout.readline()
-        assert line, f"the peer died with exit code {self._process.wait(10)}"
+        assert line, f"the peer died with exit code {self._process.wait(WAIT_S)}"
         return json.loads(line)
 
     def _release(self) -> None:
@@ -189,7 +189,7 @@ class Received:
     def payloads(self) -> list[bytes]:
         return [message.payload for message in self.messages]
 
-    def until(self, *payloads: bytes, timeout: float = 10.0) -> bool:
+    def until(self, *payloads: bytes, timeout: float = WAIT_S) -> bool:
         """Have exactly these payloads arrived, in this order?"""
         return until(lambda: self.payloads == list(payloads), timeout)
 

@@ -24,7 +24,7 @@ from pebble.transports.settings import TlsSettings
 from pebble.transports.tls import make_context
 from pebble.transports.topics import check_topic
 from pebble.transports.zenoh.keymap import key_to_topic, topic_to_key
-from tests.support import ROOT, until
+from tests.support import ROOT, WAIT_S, until
 
 
 def test_retained_topics_are_bounded_in_number() -> None:
@@ -64,7 +64,7 @@ def test_a_slow_handlers_queue_is_bounded_in_bytes(monkeypatch: pytest.MonkeyPat
     goes_on, received = threading.Event(), list[int]()
 
     def handle(message: Message) -> None:
-        goes_on.wait(10)
+        goes_on.wait(WAIT_S)
         received.append(message.payload[0])
 
     with MemoryTransport("client", MemoryHub()) as client:

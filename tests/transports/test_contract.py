@@ -21,7 +21,7 @@ from paho.mqtt.client import topic_matches_sub
 
 from pebble.errors import TransportError
 from pebble.transports import Message, QoS, State, Transport, clock
-from tests.support import ROOT, THOROUGH, until
+from tests.support import ROOT, THOROUGH, WAIT_S, quickly, until
 from tests.transports.net import Net, Received
 
 LATEST, DELIVERED = QoS.LATEST, QoS.DELIVERED
@@ -181,7 +181,7 @@ def test_T03_delivered_messages_arrive_in_order(net: Net, base: str) -> None:
         payload = b"%d" % number
         assert sender.publish(f"{base}/{number % 3}", payload, qos=DELIVERED)
         wanted.append(payload)
-    assert until(lambda: len(received.payloads) >= len(wanted), 30)
+    assert until(lambda: len(received.payloads) >= len(wanted))
     for lane in range(3):
         assert [p for p in received.payloads if int(p) % 3 == lane] == wanted[lane::3]
 
@@ -194,10 +194,10 @@ def test_T04_what_was_not_accepted_is_never_delivered(net: Net, base: str) -> No
         assert until(lambda: sender.state is State.CONNECTING)
         accepted, refused_before = [], sender.counters["refused"]
         for number in range(100):
-            payload, began = b"%d" % number, time.monotonic()
-            if sender.publish(base, payload, qos=QoS(number % 2)):
-                accepted.append(payload)
-            assert time.monotonic() - began < 1.0
+            payload = b"%d" % number
+            with quickly():
+                if sender.publish(base, payload, qos=QoS(number % 2)):
+                    accepted.append(payload)
         assert sender.counters["refused"] - refused_before == 100 - len(accepted)
         net.start_network()
     drained(sender, receiver, base)
@@ -207,7 +207,7 @@ def test_T04_what_was_not_accepted_is_never_delivered(net: Net, base: str) -> No
 def test_T04_a_transport_that_is_not_open_refuses(net: Net, base: str) -> None:
     client = net.client("never-opened", opened=False)
     assert client.publish(base, b"x", qos=DELIVERED) is False
-    client.open(10)
+    client.open(WAIT_S)
     client.close()
     assert client.publish(base, b"x", qos=DELIVERED, retain=True) is False
     with pytest.raises(TransportError):
@@ -366,7 +366,7 @@ def test_T09_running_clients_restore_their_retained_state(net: Net, base: str) -
         net.restart_network(forget=True)
     received = Received()
     net.client("late").subscribe(f"{base}/+", received)
-    assert until(lambda: len(received.messages) == 2, 2.0)
+    assert until(lambda: len(received.messages) == 2)
 
 
 def test_T09_what_is_not_to_be_remembered_is_sent_once(net: Net, base: str) -> None:
@@ -405,7 +405,7 @@ def test_T09_only_what_changed_during_the_outage_is_sent(net: Net, base: str) ->
         net.start_network()
     net.client("late").subscribe(f"{base}/+", received)
     wanted = {f"{base}/same": b"1", f"{base}/changed": b"2", f"{base}/flag": b"by other"}
-    assert until(lambda: {m.topic: m.payload for m in received.messages} == wanted, 2.0)
+    assert until(lambda: {m.topic: m.payload for m in received.messages} == wanted)
 
 
 # -- T10: wills
@@ -416,7 +416,7 @@ def test_T10_the_will_is_spoken_once_when_a_client_is_killed(net: Net, base: str
     net.client("watcher").subscribe(f"{base}/will", received)
     peer = net.peer("mortal", will=Message(f"{base}/will", b"gone", DELIVERED, True))
     peer.kill()
-    assert received.until(b"gone", timeout=5)
+    assert received.until(b"gone")
     late, retained = net.client("late"), Received()
     late.subscribe(f"{base}/will", retained)
     assert retained.until(b"gone")
@@ -550,11 +550,11 @@ def test_T19_a_message_knows_how_long_it_has_waited_for_a_process_that_stood_sti
     def handle(message: Message) -> None:
         waited.append(message.waited_s)
         stopped.set()
-        go_on.wait(10)
+        go_on.wait(WAIT_S)
 
     client.subscribe(base, handle, direct=direct)
     assert sender.publish(base, b"first", qos=DELIVERED)
-    assert stopped.wait(10)
+    assert stopped.wait(WAIT_S)
     assert sender.publish(base, b"second", qos=DELIVERED)
     drained(sender, net.client("bystander"), base)  # by then it is on its way to every subscriber
     now = clock.since_boot
@@ -627,7 +627,7 @@ def test_T13_publish_subscribe_and_close_work_inside_a_handler(net: Net, base: s
     assert inner.until(b"1")
     client.publish(f"{base}/ask", b"2", qos=DELIVERED)
     client.publish(f"{base}/end", b"", qos=DELIVERED)
-    assert closed.wait(10)
+    assert closed.wait(WAIT_S)
     assert client.state is State.CLOSED
     assert inner.payloads == [b"1"]
 
@@ -689,7 +689,7 @@ def test_T13_close_waits_for_a_quick_handler_that_is_running(net: Net, base: str
 
     subscription = client.subscribe(base, handler, direct=direct)
     client.publish(base, b"x", qos=DELIVERED)
-    assert started.wait(10)
+    assert started.wait(WAIT_S)
     subscription.close()
     assert ended.is_set()
 
@@ -720,7 +720,7 @@ def test_T14_a_slow_handler_delays_only_itself(net: Net, base: str, caplog: pyte
 
     def stuck(message: Message) -> None:
         slow(message)
-        release.wait(30)
+        release.wait(WAIT_S)
 
     subscription = client.subscribe(base, stuck, limit=10)
     client.subscribe(f"{base}/#", fast)
@@ -796,7 +796,7 @@ def test_T17_close_is_idempotent_and_leaves_nothing_behind(net: Net, base: str) 
 def test_T17_a_closed_transport_can_be_opened_again(net: Net, base: str) -> None:
     client, received = net.client("client"), Received()
     client.close()
-    client.open(10)
+    client.open(WAIT_S)
     client.subscribe(base, received)
     client.publish(base, b"again", qos=DELIVERED)
     assert received.until(b"again")

@@ -25,7 +25,7 @@ from pebble.transports.mqtt import refused_topics
 from pebble.transports.mqtt.client import Client, Opening
 from pebble.transports.mqtt.connection import UNACKED_LIMIT, UNACKED_RESERVE
 from pebble.transports.tls import make_context
-from tests.support import ROOT, Broker, RefusingBroker, beside, free_port, until
+from tests.support import ROOT, WAIT_S, Broker, RefusingBroker, beside, free_port, quickly, until
 from tests.tcp_proxy import BridgelessProxy, ForbiddingProxy, Hole, SlowTcpProxy, TcpProxy
 from tests.transports.net import Received
 
@@ -75,7 +75,7 @@ class Clients:
         client = create("mqtt", name or f"client{len(self._made)}", settings, will=will)
         self._made.append(client)
         if opened:
-            client.open(10)
+            client.open(WAIT_S)
             assert client.state is State.CONNECTED, client.problem
         return client
 
@@ -180,7 +180,7 @@ def test_what_was_typed_into_a_silent_link_never_arrives(
     for _ in range(20):
         operator.publish(topic, b"into the hole", qos=DELIVERED)
         operator.publish(f"{topic}/latest", b"into the hole")
-    assert until(lambda: operator.state is State.CONNECTING, 5)
+    assert until(lambda: operator.state is State.CONNECTING)
     assert "has not answered" in operator.problem
     assert operator.publish(topic, b"without a connection", qos=DELIVERED) is False
     proxy.resume()
@@ -254,7 +254,7 @@ def test_a_topic_on_which_the_broker_hangs_up_costs_that_topic_until_it_is_allow
                 robot.publish(f"{topic}/online", b"1", retain=True)
 
         with beside(stream, stopping):
-            assert until(lambda: robot.counters["withheld"] > 0, 20)
+            assert until(lambda: robot.counters["withheld"] > 0)
             assert reconnected(robot)
             for number in range(20):
                 other.publish(f"{topic}/command", b"%d" % number, qos=DELIVERED)
@@ -263,7 +263,7 @@ def test_a_topic_on_which_the_broker_hangs_up_costs_that_topic_until_it_is_allow
             assert f"{topic}/forbidden" in error
             assert not received.payloads
             proxy.forbidden = set()
-            assert until(lambda: received.payloads, 20)
+            assert until(lambda: received.payloads)
 
 
 def test_close_does_not_wait_for_a_silent_broker(clients: Clients, proxy: TcpProxy) -> None:
@@ -273,9 +273,8 @@ def test_close_does_not_wait_for_a_silent_broker(clients: Clients, proxy: TcpPro
     client.open(0.1)
     threads = {thread for thread in set(threading.enumerate()) - others if thread.name.startswith("pebble-mqtt")}
     assert threads
-    began = time.monotonic()
-    client.close()
-    assert time.monotonic() - began < 1.0
+    with quickly():
+        client.close()
     assert until(lambda: not threads & set(threading.enumerate()))
 
 
@@ -325,7 +324,7 @@ def test_unacknowledged_messages_are_bounded(tmp_path: Path, clients: Clients, t
         assert client.publish(f"{topic}/kept", b"parked", qos=DELIVERED, retain=True)
         proxy.resume()
         numbers = [b"%d" % number for number in range(UNACKED_LIMIT)]
-        assert received.until(*numbers, *[b"stop"] * UNACKED_RESERVE, b"parked", timeout=30)
+        assert received.until(*numbers, *[b"stop"] * UNACKED_RESERVE, b"parked")
     broker.stop()
 
 
@@ -440,7 +439,7 @@ def test_a_handshake_may_take_long_while_bytes_arrive(tls_broker: Broker, goes_o
         with closing(Client(opening, Mock(), bridge=False)) as client:
             with nullcontext() if goes_on else pytest.raises(TimeoutError, match="TLS handshake"):
                 client.open()
-            assert patience_s < time.monotonic() - began < 5
+            assert patience_s < time.monotonic() - began
 
 
 @pytest.mark.parametrize(
@@ -507,5 +506,5 @@ def test_where_large_packets_are_lost_segments_become_small(
         hears.subscribe(topic, received)
         large = partial(sends.publish, topic, bytes(3000), qos=QoS(retain), retain=retain)
         large()
-        assert until(lambda: (retain or large()) and bytes(3000) in received.payloads, 20)
+        assert until(lambda: (retain or large()) and bytes(3000) in received.payloads)
         assert len([line for line in caplog.messages if "lose large packets" in line]) == 1

@@ -24,7 +24,7 @@ from pebble.transports.mqtt.ending import Lost, Silent
 from pebble.transports.mqtt.packets import Filter
 from pebble.transports.mqtt.transport import MqttTransport
 from tests.kit.mqtt_bytes import packet, publish
-from tests.support import Broker, until
+from tests.support import WAIT_S, Broker, until
 from tests.transports.net import Received
 
 PONG = packet(0xD0, b"")
@@ -56,7 +56,7 @@ class Link:
         assert until(lambda: not self.connection.dialling)  # from then on it waits for the answer
         self.now += round_trip_s
         self.other.sendall(b"\x20\2\0\0")
-        connecting.join(5)
+        connecting.join(WAIT_S)
 
     def sends(self, *data: bytes) -> None:
         """The other end does; all of it is in our socket when this returns."""
@@ -144,7 +144,7 @@ def test_what_waits_for_a_full_socket_is_stale_once_a_delivered_message_of_its_t
         link.connection.pump(0.0, link.messages.extend)
         return b"newest" in received
 
-    assert until(drained, 20)
+    assert until(drained)
     assert b"stale" not in received
 
 

@@ -15,7 +15,7 @@ import zenoh
 
 from pebble.transports import Message, QoS, State, ZenohSettings, create
 from pebble.transports.zenoh import session as zenoh_session
-from tests.support import until
+from tests.support import WAIT_S, until
 from tests.transports.forked import Forked
 from tests.transports.net import Net
 
@@ -30,7 +30,7 @@ class HubProcess:
     def start(self) -> HubProcess:
         settings = msgspec.json.encode(self.settings, enc_hook=str).decode()
         self._process = Forked("pebble.extensions.lab.rig.hub", [settings])
-        probe = create("zenoh", "probe", dataclasses.replace(self.settings, client=True, listen=())).open(10)
+        probe = create("zenoh", "probe", dataclasses.replace(self.settings, client=True, listen=())).open(WAIT_S)
         assert probe.state is State.CONNECTED, probe.problem
         probe.close()
         return self
@@ -44,7 +44,7 @@ class HubProcess:
         assert process is not None
         os.kill(process.pid, signal.SIGCONT)
         os.kill(process.pid, number)
-        return process.wait(10), process.printed
+        return process.wait(WAIT_S), process.printed
 
     def signal(self, number: int) -> None:
         os.kill(self.pid, number)

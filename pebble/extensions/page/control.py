@@ -305,7 +305,7 @@ class Control:
         robot, driven = server.robots.view(op.ref), server.drivers.robot(op.ref)
         # To take over a robot that itself decides who drives it needs a right of its own. Where only this server
         # decides, all pages that may drive may take control from each other.
-        right = "take" if op.over and driven.keeps else "drive"
+        right = "take" if op.over and driven.keeps_control else "drive"
         if not self._may(right, op):
             return
         if self._why_not or robot is None:

@@ -26,7 +26,7 @@ from pebble.transports import Message, MqttSettings, QoS, State, Transport, crea
 from pebble.transports.counters import Counters
 from tests.kit.robot import BASE as BASE
 from tests.kit.robot import ROBOT, SILENCE_S, Program, ProgramRobot
-from tests.support import until
+from tests.support import WAIT_S, until
 
 WIDTH, HEIGHT = 320, 240
 
@@ -65,13 +65,13 @@ class MediaProgram(ProgramRobot):
         """The last report; before the first one, one that says nothing."""
         return [MediaReport(running=False), *self.reports][-1]
 
-    def reported(self, timeout: float = 15.0, **expected: Any) -> bool:
+    def reported(self, timeout: float = WAIT_S, **expected: Any) -> bool:
         """Until the newest report says so."""
         return until(lambda: all(getattr(self.newest, name) == value for name, value in expected.items()), timeout)
 
 
 def client(name: str, port: int) -> Transport:
-    transport = create("mqtt", name, MqttSettings(host="127.0.0.1", port=port, silence_s=SILENCE_S)).open(10)
+    transport = create("mqtt", name, MqttSettings(host="127.0.0.1", port=port, silence_s=SILENCE_S)).open(WAIT_S)
     assert transport.state is State.CONNECTED, transport.problem
     return transport
 
@@ -91,7 +91,7 @@ class Device(ABC):
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self._stopping.set()
-        self._thread.join(10)
+        self._thread.join(WAIT_S)
         self.writer.close()
 
     @abstractmethod
@@ -130,7 +130,7 @@ class Operator(ABC):
     @abstractmethod
     def receive(self, message: Message) -> None: ...
 
-    def wait(self, count: int, timeout: float = 20.0) -> list[Any]:
+    def wait(self, count: int, timeout: float = WAIT_S) -> list[Any]:
         """Until so many packets more have come; returns these."""
         before = len(self.received)
         came = until(lambda: len(self.received) >= before + count, timeout)
@@ -138,7 +138,7 @@ class Operator(ABC):
         return self.received[before:]
 
     def wait_for(self, encoding: str) -> None:
-        assert until(lambda: bool(self.received) and self.received[-1].encoding == encoding, 20), f"no {encoding} came"
+        assert until(lambda: bool(self.received) and self.received[-1].encoding == encoding), f"no {encoding} came"
 
     def close(self) -> None:
         self.transport.close()

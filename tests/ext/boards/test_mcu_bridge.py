@@ -19,7 +19,7 @@ from tests.ext.boards.mcu_wire import IMU, LAMP, STATION, F, I, M
 from tests.kit.board import ScriptedMcu, SerialRig, motion, summary
 from tests.kit.robot import ProgramRobot
 from tests.services.serial_mcu_bridge.test_text_protocols import FAST, SLOW
-from tests.support import Broker, until
+from tests.support import WAIT_S, Broker, until
 
 
 def test_the_launcher_is_notified_of_outlets_while_they_are_in_use(
@@ -214,7 +214,7 @@ def test_new_firmware_while_it_runs(rig: SerialRig) -> None:
     renumbered = tuple(I(**{**vars(one), "id": one.id + 10, "channel": ""}) for one in LAMP.interfaces)
     mcu.manifest = LAMP.but(interfaces=renumbered, hash="h2")
     mcu.send(wire.frame(wire.HELLO, mcu.manifest.hello()))
-    assert until(lambda: [body["schema_hash"] for body in rig.world.payloads("mcu/lamp-1/describe")] == ["h1", "h2"], 3)
+    assert until(lambda: [body["schema_hash"] for body in rig.world.payloads("mcu/lamp-1/describe")] == ["h1", "h2"])
     assert rig.cleared("lights/lamp")
     assert rig.claimed()
     rig.world.command("lights/lamp", {"level": 40, "on": True})
@@ -230,7 +230,7 @@ def test_a_stale_manifest_of_a_killed_bridge_is_cleared_by_the_next(
 ) -> None:
     """The device was removed while no bridge was running."""
     monkeypatch.setattr(peers, "CONFIRM_S", 1.5)
-    left = rig.network.client("killed").open(10)
+    left = rig.network.client("killed").open(WAIT_S)
     manifest = b'{"protocol":"pebble_serial_v1","schema_version":1,"interface_count":0,"schema_hash":"h",' \
                b'"device_uid":"ghost","firmware_version":"1","model":"m","interfaces":[]}'  # fmt: skip
     left.publish(f"{rig.base}/outgoing/mcu/ghost/describe", manifest, qos=1, retain=True)  # type: ignore[arg-type]
@@ -270,10 +270,10 @@ def test_a_silent_inertial_sensor_ends_the_process(memory_rig: SerialRig, monkey
     assert running.alive
     mcu.silent = True
     stopped = time.monotonic()
-    assert until(lambda: not running.alive, 5)
-    assert 0.5 < time.monotonic() - stopped < 2.5
+    assert until(lambda: not running.alive)
+    assert time.monotonic() - stopped > 0.5
     assert str(running.error) == "no sample for 0.6 s"
-    assert memory_rig.world.newest_raw("mcu/goob-imu-nano/describe") == []
+    assert memory_rig.cleared("mcu/goob-imu-nano/describe")
 
 
 def test_a_refused_alias_is_logged_and_its_interface_still_works(

@@ -26,7 +26,7 @@ from pebble.extensions.scripts.perception.tags import Place, Tag
 from tests.ext.scripts.perception.wheels_rig import powers, touches, turning
 from tests.ext.scripts.script.station import Station
 from tests.ext.scripts.shipped.stand_in import Sensors
-from tests.support import Child, cases, some, until
+from tests.support import WAIT_S, Child, cases, some, until
 
 TRUE = Wheels(61.0 * 1.01, 61.0 * 0.99, 130.5 * 1.03)
 ROOM = {"x_min": -0.5, "x_max": 2.4, "y_min": -2.0, "y_max": 2.0}
@@ -311,13 +311,13 @@ def test_an_emergency_stop_ends_it_and_nothing_is_written(sensors: Sensors) -> N
             [sys.executable, "-m", "pebble.cli", *command],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         )  # fmt: skip
-        assert until(lambda: station.moves(), 60), program.communicate(timeout=10)[0]
+        assert until(lambda: station.moves(), 60), program.communicate(timeout=WAIT_S)[0]
         station.publish_state(latched=True, count=1, by="ann")
-        assert until(station.rests, 10)
-        said = program.communicate(timeout=30)[0]
+        assert until(station.rests)
+        said = program.communicate(timeout=WAIT_S)[0]
     finally:
         ended.set()
-        rolling.join(10)
+        rolling.join(WAIT_S)
     assert program.returncode == 3, said
     assert "emergency stop by ann" in said
     assert said.splitlines()[-1] == "pebble: ended; nothing was written"

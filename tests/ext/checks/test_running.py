@@ -27,7 +27,7 @@ from tests.commands.command_line import running
 from tests.robot.named import Hall, Named
 from tests.robot.operator import Operator, retained_messages
 from tests.robot.rig import BASE, DEVICES, STOP, Rig
-from tests.support import ROOT, beside, free_port, further, until
+from tests.support import ROOT, WAIT_S, beside, free_port, further, until
 
 pytestmark = pytest.mark.alone  # whole robots
 
@@ -124,7 +124,7 @@ def test_one_that_is_ended_while_wheels_turn_sends_a_zero_and_gives_control_back
         process.stdin.flush()
         assert until(lambda: moved(rig, began), 90)
         process.send_signal(signal.SIGTERM)
-        assert process.wait(30) != 0
+        assert process.wait(WAIT_S) != 0
     assert until(lambda: rig.operator.on("incoming/drive-values", began)[-1].json.get("valid_ms") == 0)
     assert until(lambda: rig.operator.last("outgoing/control/serial").json["key"] == "")  # type: ignore[union-attr]
     assert until(lambda: not rig.mcu.turning())
@@ -167,7 +167,7 @@ def test_a_stop_of_another_person_meanwhile_stays(rig: Rig) -> None:
     ending = threading.Event()
 
     def stops_too() -> None:
-        assert until(lambda: ending.is_set() or rig.operator.on("incoming/estop", began), 30)
+        assert until(lambda: ending.is_set() or rig.operator.on("incoming/estop", began))
         rig.operator.send("incoming/estop", {"stop": "00000000000000b2", "by": "zoe"})
 
     with beside(stops_too, ending):
@@ -194,10 +194,10 @@ def test_what_an_old_id_has_left_is_named_with_what_removes_it(rig: Rig) -> None
 
 def test_a_pulled_board_is_named(rig: Rig) -> None:
     rig.mcu.command("unplug")
-    assert until(lambda: found(rig, only("boards"), 1.0)["boards"][0] == "failed", 30)
+    assert until(lambda: found(rig, only("boards"), 1.0)["boards"][0] == "failed")
     assert str(rig.mcu.port) in found(rig, only("boards"), 1.0)["boards"][1]
     rig.mcu.command("replug")
-    assert until(lambda: found(rig, only("boards"))["boards"][0] == "ok", 30)
+    assert until(lambda: found(rig, only("boards"))["boards"][0] == "ok")
 
 
 def test_how_a_robot_that_is_off_is_started(rig: Rig) -> None:

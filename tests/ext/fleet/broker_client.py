@@ -12,8 +12,7 @@ import paho.mqtt.client as paho
 from paho.mqtt.enums import CallbackAPIVersion
 
 from pebble.transports.base import Message
-
-_TIMEOUT_S = 3.0
+from tests.support import WAIT_S
 
 
 class BrokerError(Exception):
@@ -42,11 +41,9 @@ class BrokerClient:
         password: str | None = None,
         *,
         will: Message | None = None,
-        timeout_s: float = _TIMEOUT_S,
     ) -> None:
         self.received: list[tuple[str, bytes]] = []
         self.closed = False  # by the broker
-        self._timeout_s = timeout_s
         self._accepted: bool | None = None
         self._waiting: set[int] = set()  # publications and subscriptions that the broker has not acknowledged
         self._client = client = paho.Client(CallbackAPIVersion.VERSION2)
@@ -91,7 +88,7 @@ class BrokerClient:
 
     def wait(self, condition: Callable[[], Any], what: str) -> None:
         """Read until ``condition``. Raises BrokerError in time, and when the broker closes the connection."""
-        deadline = time.monotonic() + self._timeout_s
+        deadline = time.monotonic() + WAIT_S
         while not condition():
             if self.closed or time.monotonic() > deadline:
                 raise BrokerError(f"the broker {'closed the connection and ' * self.closed}did not {what}")

@@ -14,7 +14,7 @@ from pebble.extensions.fleet.folder import CONF, Fleet, Server, load
 from pebble.extensions.fleet.roles import Account
 from pebble.extensions.operator.places import mosquitto_path
 from tests.ext.fleet.broker_client import BrokerClient, Place
-from tests.support import Child, free_port, listening, until
+from tests.support import WAIT_S, Child, free_port, listening, until
 
 HOST = "127.0.0.1"
 
@@ -66,12 +66,12 @@ class FleetBroker:
         log = (self.folder / "log").open("ab")
         self._process = Child(command, stdout=log, stderr=log)
         ports = [port for port in (self.port, self.unencrypted) if port is not None]
-        assert until(lambda: all(map(listening, ports)), 10), (self.folder / "log").read_text()
+        assert until(lambda: all(map(listening, ports))), (self.folder / "log").read_text()
 
     def stop(self) -> None:
         if self._process is not None:
             self._process.kill()
-            self._process.wait(10)
+            self._process.wait(WAIT_S)
             self._process = None
 
     def change(self, after: Fleet, passwords: Mapping[str, str] | None = None) -> str:

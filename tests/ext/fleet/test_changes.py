@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from getpass import getuser
@@ -21,7 +20,7 @@ from pebble.extensions.fleet.roles import Account
 from tests.commands.command_line import Run
 from tests.ext.fleet.broker_client import BrokerClient, RefusedError
 from tests.ext.fleet.brokers import FleetBroker
-from tests.support import ROOT, until
+from tests.support import ROOT, quickly, until
 
 DRIVER, VIEWER = Account(roles=("driver",)), Account(roles=("viewer",))
 GOOB = Account(roles=("robot",), bases=("pebble/robots/goob",))
@@ -49,21 +48,15 @@ def passes(broker: FleetBroker, client: BrokerClient, topic: str) -> bool:
 
 def test_a_change_counts_at_once_and_costs_no_other_connection(broker: FleetBroker) -> None:
     with broker.login("goob") as robot, broker.login("otto") as otto:
-        took = {}
-        for what, change in (
-            ("add", lambda: broker.add("zoe", DRIVER)),
-            ("role", lambda: broker.change(broker.fleet.with_account("zoe", VIEWER))),
-            ("remove", lambda: broker.remove("zoe")),
-        ):
-            began = time.monotonic()
-            assert change() == "at once"
-            took[what] = time.monotonic() - began
+        with quickly():
+            assert broker.add("zoe", DRIVER) == "at once"
+            assert broker.change(broker.fleet.with_account("zoe", VIEWER)) == "at once"
+            assert broker.remove("zoe") == "at once"
         for one in (robot, otto):
             one.listen(0.05)
             one.publish("pebble/robots/goob/outgoing/end", b"")
             one.flush()
             assert not one.closed
-    assert max(took.values()) < 0.5, took
 
 
 def test_a_role_counts_for_connections_that_are_there(broker: FleetBroker) -> None:
@@ -72,10 +65,10 @@ def test_a_role_counts_for_connections_that_are_there(broker: FleetBroker) -> No
     with broker.login("zoe") as zoe:
         assert passes(broker, zoe, DRIVE)
         broker.change(broker.fleet.with_account("zoe", VIEWER))
-        assert until(lambda: not passes(broker, zoe, DRIVE), 3)
+        assert until(lambda: not passes(broker, zoe, DRIVE))
         assert passes(broker, zoe, STOP)
         broker.change(broker.fleet.with_account("zoe", DRIVER))
-        assert until(lambda: passes(broker, zoe, DRIVE), 3)
+        assert until(lambda: passes(broker, zoe, DRIVE))
 
 
 @pytest.mark.parametrize("how", ["remove", "password"])
@@ -84,7 +77,7 @@ def test_who_is_removed_or_gets_another_password_is_disconnected(broker: FleetBr
     with broker.login("otto") as otto:
         old = broker.passwords["otto"]
         change[how](broker)
-        assert until(lambda: otto.listen(0.05) or otto.closed, 3)
+        assert until(lambda: otto.listen(0.05) or otto.closed)
     with pytest.raises(RefusedError):
         BrokerClient(broker.place, "otto", old)
     assert _gets_in(broker, "otto") == (how == "password")
@@ -103,7 +96,7 @@ def test_who_takes_all_connections_is_removed(tmp_path: Path, monkeypatch: pytes
     with FleetBroker(tmp_path / "hall", {"otto": DRIVER, "zoe": DRIVER}) as broker, ExitStack() as all_of_them:
         clients = [all_of_them.enter_context(broker.login("otto")) for _ in range(10)]
         assert broker.remove("otto") == "at once"
-        assert until(lambda: all(client.listen(0.01) or client.closed for client in clients), 3)
+        assert until(lambda: all(client.listen(0.01) or client.closed for client in clients))
         assert _gets_in(broker, "zoe")
 
 
@@ -119,11 +112,11 @@ def test_a_change_while_mosquitto_is_down_counts_when_it_runs(broker: FleetBroke
 def test_a_password_survives_a_change_of_level(broker: FleetBroker) -> None:
     broker.change(replace(broker.fleet, level="named"))
     with broker.login("otto") as otto:
-        named = until(lambda: passes(broker, otto, "pebble/robots/goob/incoming/by/otto/drive-values"), 3)
+        named = until(lambda: passes(broker, otto, "pebble/robots/goob/incoming/by/otto/drive-values"))
         assert (named, passes(broker, otto, DRIVE), passes(broker, otto, STOP)) == (True, False, True)
     broker.change(replace(broker.fleet, plain=True))
     with broker.login("otto") as otto:
-        assert until(lambda: passes(broker, otto, DRIVE), 3)
+        assert until(lambda: passes(broker, otto, DRIVE))
 
 
 # -- what a check finds
@@ -203,7 +196,7 @@ def test_a_fleet_of_the_plugin_becomes_one_of_files(tmp_path: Path, run: Run, mo
             fleet("check")
             assert run.err.count("pebble: ") == 3  # vera and mia have no password
             assert fleet("remove", "otto") == 0
-            assert until(lambda: otto.listen(0.05) or otto.closed, 3)
+            assert until(lambda: otto.listen(0.05) or otto.closed)
     assert before == ["otto", "goob", "ghost", "mia", "admin"]
     assert after == ["otto", "goob", "admin"]
     assert named == ["ghost", "vera", "mia"]

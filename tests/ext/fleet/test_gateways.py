@@ -23,12 +23,12 @@ from pebble.transports import Message, MqttSettings, QoS, Transport, ZenohSettin
 from pebble.transports.memory import MemoryTransport
 from tests.ext.neighbours.test_service import One
 from tests.firmware.wireless_rig import Robots
-from tests.support import Broker, free_port, until
+from tests.support import SOON_S, WAIT_S, Broker, free_port, until
 from tests.transports.forked import Forked
 from tests.transports.zenoh_net import HubProcess
 
 pytestmark = pytest.mark.alone
-SECOND_S, BACK_S, STOP_S = 10.0, 6.0, 1.0
+STOP_S = 1.0
 ROBOT = "pebble/robots/r0"
 
 
@@ -80,14 +80,15 @@ class Hall(Gateways):
         return self.start(name, hub={"connect": [self.endpoint]})
 
     def drives(self) -> bool:
-        """Send a heartbeat and a command; True if the robot gets that."""
+        """Send a heartbeat and a command; True if the robot gets a command meanwhile."""
+        before = len(self.received)
         self.number += 1
         self.sent[self.number] = time.monotonic()
         heartbeat = json.dumps({"t": int(time.time() * 1000)}).encode()
         self.robot.publish(ONLINE.topic(ROBOT), heartbeat, qos=QoS.DELIVERED, retain=True)
         command = json.dumps({"x": 0.5, "z": 0.0, "n": self.number}).encode()
         self.operator.publish(DRIVE.topic(ROBOT), command, qos=QoS.DELIVERED)
-        return until(lambda: self.number in self.received, 0.25)
+        return until(lambda: len(self.received) > before, 0.25)
 
     def _on_drive(self, message: Message) -> None:
         if message.payload.strip():  # else a probe for cycles
@@ -102,40 +103,39 @@ def hall(tmp_path: Path) -> Iterator[Hall]:
 
 def test_a_second_one_does_not_start_and_takes_over_where_it_is_tried_again(hall: Hall) -> None:
     """As systemd does."""
-    assert until(hall.drives, 60), hall.gateway.printed
+    assert until(hall.drives), hall.gateway.printed
     second = hall.gate("gate-2")
-    assert until(lambda: hall.drives() and second.poll() == 1, SECOND_S)
+    assert until(lambda: hall.drives() and second.poll() == 1)
     assert f"gateway gate-2 does not start: gate-1 carries {ROBOT}" in second.printed
     hall.gateway.kill()
-    hall.gateway.wait(10)
-    began = time.monotonic()
+    hall.gateway.wait(WAIT_S)
     hall.gate("gate-2")
-    assert until(hall.drives, 30)
-    assert time.monotonic() - began <= BACK_S
+    assert until(hall.drives)
     stopped = time.monotonic()
     hall.operator.publish(ESTOP.topic(ROBOT), b'{"stop": "0123456789abcdef"}', qos=QoS.DELIVERED, urgent=True)
-    assert until(lambda: hall.stops, 10)
+    assert until(lambda: hall.stops)
     assert hall.stops[0] - stopped <= STOP_S
     again = hall.gate("gate-1")
-    assert until(lambda: hall.drives() and again.poll() == 1, SECOND_S)
+    assert until(lambda: hall.drives() and again.poll() == 1)
     assert hall.received == sorted(set(hall.received)), "none came twice, or after a newer one"
 
 
 def test_what_waited_for_a_gateway_that_stood_still_is_too_old(hall: Hall) -> None:
-    assert until(hall.drives, 60), hall.gateway.printed
+    assert until(hall.drives), hall.gateway.printed
     os.kill(hall.gateway.pid, signal.SIGSTOP)
-    time.sleep(0.2)  # until all its threads stand still
+    threads = Path(f"/proc/{hall.gateway.pid}/task").glob("*/stat")
+    assert until(lambda states=[*threads]: {one.read_text().rpartition(")")[2].split()[0] for one in states} == {"T"})
     first, stood = hall.number + 1, time.monotonic()
     while time.monotonic() < stood + 2.0:
         hall.drives()
     old = {number for number in range(first, hall.number + 1) if time.monotonic() - hall.sent[number] > 1.0}
     os.kill(hall.gateway.pid, signal.SIGCONT)
-    assert until(hall.drives, 30)
+    assert until(hall.drives)
     assert old
     assert not old & {*hall.received}
     stopped = time.monotonic()
     hall.operator.publish(ESTOP.topic(ROBOT), b'{"stop": "0123456789abcdef"}', qos=QoS.DELIVERED, urgent=True)
-    assert until(lambda: hall.stops, 10)
+    assert until(lambda: hall.stops)
     assert hall.stops[0] - stopped <= STOP_S
 
 
@@ -164,7 +164,7 @@ class Lan(Gateways):
         run = next(_RUNS)
         robot = Robot(self.goob.config, MemoryTransport(f"script-{run}", self.goob.hub).open(), lambda _above: run)
         self._stack.callback(robot.close)
-        assert until(lambda: robot.neighbour("minilamp").online, 20)
+        assert until(lambda: robot.neighbour("minilamp").online)
         return robot
 
     def drives(self, robot: Robot, seconds: float) -> bool:
@@ -189,7 +189,7 @@ def lan() -> Iterator[Lan]:
         made = Lan(Path(folder), stack)
         made.board.wait_online()
         topics = (ONLINE.topic(LAMP), CAPABILITIES.topic(LAMP), f"{LAMP}/outgoing/neighbours")
-        assert until(lambda: {*topics} <= {one.topic for one in list(made.received)}, 20), made.gateway.printed
+        assert until(lambda: {*topics} <= {one.topic for one in list(made.received)}), made.gateway.printed
         yield made
 
 
@@ -201,7 +201,7 @@ def test_a_board_is_driven_by_a_neighbour_until_a_person_does(lan: Lan) -> None:
     assert until(lambda: lan.newest("neighbours")["driven_by"] == "goob")
     lan.send(DRIVE.topic(LAMP), {"x": 0, "z": 0})
     assert until(lambda: lamp.why_refused)
-    assert until(lambda: not lan.board.moving("minilamp"), STOP_S)
+    assert until(lambda: not lan.board.moving("minilamp"), SOON_S)
     assert not lan.drives(robot, 0.5), "a person has ended its run"
     time.sleep(2.0)  # which holds for this long
     again = lan.script()

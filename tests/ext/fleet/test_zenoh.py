@@ -27,7 +27,7 @@ from pebble.transports.zenoh import wire
 from tests.ext.fleet import test_attempts
 from tests.ext.fleet.test_attempts import ACCOUNTS, FRED, GOOB, TOPICS
 from tests.ext.fleet.zenoh_account import Plan
-from tests.support import free_port, until
+from tests.support import WAIT_S, free_port, until
 from tests.transports.forked import Forked
 from tests.transports.zenoh_net import HubProcess
 from tests.transports.zenoh_net import stranger_at as raw
@@ -98,7 +98,7 @@ class Hall:
             yield process
         finally:
             process.kill()
-            process.wait(10)
+            process.wait(WAIT_S)
 
     def of(self, name: str) -> set[str]:
         return {topic for sender, topic in self.received if sender == name}
@@ -142,7 +142,7 @@ def test_each_account_writes_what_it_may_and_nothing_else(hall: Hall) -> None:
         expected[name] = {topic for topic in TOPICS if lets_through(name, topic, hall.fleet.level)}
         with hall.account(name, topics=TOPICS) as client:
             # A drive command that a busy machine holds up is too old for the hub: that is sent again.
-            arrived = until(lambda name=name, client=client: writes_all(name, client), 30)
+            arrived = until(lambda name=name, client=client: writes_all(name, client))
             assert arrived, (name, expected[name] - hall.of(name))
     hall.mark("written")
     for name in set(NAMES) - {"dora"}:
@@ -297,7 +297,7 @@ def test_what_an_account_asks_or_retains_holds_up_no_one_who_comes(hall: Hall, n
             received: list[str] = []
             with create("zenoh", f"late-{number}", hall.settings("otto")) as late:
                 late.subscribe(f"{GOOB}/outgoing/#", lambda message: received.append(message.topic))  # noqa: B023
-                assert until(lambda: received, 10), number  # noqa: B023
+                assert until(lambda: received), number  # noqa: B023
     assert memory(hall.hub.pid) - before < 300
     hall.eye.publish(STATE, b"", qos=QoS.DELIVERED, retain=True)
 

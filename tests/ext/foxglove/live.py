@@ -24,7 +24,7 @@ from pebble.contract.channels import Channel
 from pebble.extensions.foxglove.run import Settings, serve
 from pebble.transports import MqttSettings, QoS, Transport, create
 from tests.commands.command_line import program
-from tests.support import Broker, until
+from tests.support import WAIT_S, Broker, until
 
 SUBPROTOCOL = "foxglove.sdk.v1"
 _FIRST = 100  # number of a subscription, less that of its channel
@@ -55,7 +55,7 @@ class Watcher:
 
     def subscribe(self, topic: str) -> None:
         """Subscribe as soon as the channel is there."""
-        assert until(lambda: topic in self.channels, 20), f"{topic} is not among {sorted(self.channels)}"
+        assert until(lambda: topic in self.channels), f"{topic} is not among {sorted(self.channels)}"
         channel = self.channels[topic]["id"]
         self._subscribed[channel + _FIRST] = topic
         self._subscribe(channel)
@@ -84,7 +84,7 @@ class Watcher:
 
     def close(self) -> None:
         self._socket.close()
-        self._thread.join(10)
+        self._thread.join(WAIT_S)
 
     def _run(self) -> None:
         try:
@@ -127,7 +127,7 @@ GOOB, FRED = "pebble/robots/goob", "pebble/robots/fred"
 
 
 def client(broker: Broker, name: str = "robot") -> Transport:
-    return create("mqtt", name, MqttSettings(host="127.0.0.1", port=broker.port)).open(5)
+    return create("mqtt", name, MqttSettings(host="127.0.0.1", port=broker.port)).open(WAIT_S)
 
 
 class Live:
@@ -147,7 +147,7 @@ class Live:
     def end(self, by: signal.Signals = signal.SIGINT) -> tuple[int, str]:
         """Exit code, and what it printed at last."""
         self.process.send_signal(by)
-        _, errors = self.process.communicate(timeout=5)
+        _, errors = self.process.communicate(timeout=WAIT_S)
         return self.process.returncode, errors
 
 
@@ -161,12 +161,12 @@ class Inside:
         self._loop, self._ending = asyncio.new_event_loop(), asyncio.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
-        self.address = self._ready.result(30)
+        self.address = self._ready.result(WAIT_S)
 
     def end(self) -> None:
         with suppress(RuntimeError):  # it has ended already
             self._loop.call_soon_threadsafe(self._ending.set)
-        self._thread.join(20)
+        self._thread.join(WAIT_S)
         assert not self._thread.is_alive()
 
     def _run(self) -> None:

@@ -27,7 +27,7 @@ from pebble.services.homeassistant.discovery import discovery, object_id
 from pebble.transports import Message, MqttSettings, QoS, Transport, create
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.kit.robot import Running
-from tests.support import ROOT, Broker, until
+from tests.support import ROOT, WAIT_S, Broker, until
 
 CONFIGS = sorted(path for path in (ROOT / "configs").glob("*.json") if path.name != "schema.json")
 PAGE = (ROOT / "docs" / "ext" / "homeassistant.md").read_text()
@@ -186,7 +186,7 @@ class Watching:
 
     def __init__(self, broker: Broker) -> None:
         self.messages: list[Message] = []
-        self.transport = create("mqtt", "home", MqttSettings(host="127.0.0.1", port=broker.port)).open(5)
+        self.transport = create("mqtt", "home", MqttSettings(host="127.0.0.1", port=broker.port)).open(WAIT_S)
         self.transport.subscribe("homeassistant/#", self.messages.append, qos=QoS.DELIVERED, direct=True)
         self.transport.subscribe("elsewhere/#", self.messages.append, qos=QoS.DELIVERED, direct=True)
 
@@ -225,7 +225,7 @@ def test_it_is_announced_again_when_home_assistant_starts_and_on_changes(
         assert "battery" in json.loads(home.devices()[2].payload)["cmps"]
         broker.kill()  # and it forgets all
         broker.start()
-        assert until(lambda: TOPIC in retained(broker), 20)
+        assert until(lambda: TOPIC in retained(broker))
     assert TOPIC in retained(broker)  # the robot is away, and Home Assistant still knows it
 
 
@@ -254,7 +254,7 @@ def test_what_an_earlier_config_announced_is_emptied_once_the_broker_is_there(
         assert not until(lambda: not saved(later).exists(), 1)  # nothing is forgotten meanwhile
         broker.start()
         stays = ["homeassistant"] if change["enabled"] else []
-        assert until(lambda: TOPIC not in retained(broker), 20)
+        assert until(lambda: TOPIC not in retained(broker))
         assert until(lambda: not saved(later).exists() or TOPIC not in saved(later).read_text())
         assert until(lambda: len(retained(broker)) == len(stays))
     assert [program.name for program in programs(later)] == stays

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from tests.commands.command_line import running
-from tests.support import Broker
+from tests.support import WAIT_S, Broker
 
 TYPE = re.compile(r"# TYPE (pebble_[a-z_]+) (gauge|counter)")
 SAMPLE = re.compile(r'(pebble_[a-z_]+)\{((?:[a-z]+="(?:[^"\\\n]|\\[\\"n])*"(?:,(?!})|(?=})))*)\} (-?[0-9.e+-]+)')
@@ -50,7 +50,7 @@ def exporter(broker: Broker, *options: str) -> Iterator[str]:
 
 def get(address: str, token: str = "") -> str:
     headers = {"Authorization": f"Bearer {token}"} if token else {}
-    with urllib.request.urlopen(urllib.request.Request(address, headers=headers), timeout=10) as answer:
+    with urllib.request.urlopen(urllib.request.Request(address, headers=headers), timeout=WAIT_S) as answer:
         text: str = answer.read().decode()
         return text
 

@@ -18,7 +18,7 @@ from pebble.transports import MqttSettings, create
 from tests.ext.metrics.scrape import exporter
 from tests.ext.metrics.test_metrics import FOLDER, media, status
 from tests.kit.played_robot import RecordingRobot
-from tests.support import Broker, Child, free_port, until
+from tests.support import WAIT_S, Broker, Child, free_port, until
 
 pytestmark = [
     pytest.mark.thorough,
@@ -95,7 +95,7 @@ class Prometheus:
     def firing(self) -> set[str]:
         """Return the alerts that fire now."""
         try:
-            with urllib.request.urlopen(f"http://127.0.0.1:{self._port}/api/v1/alerts", timeout=10) as answer:
+            with urllib.request.urlopen(f"http://127.0.0.1:{self._port}/api/v1/alerts", timeout=WAIT_S) as answer:
                 alerts = json.load(answer)["data"]["alerts"]
         except OSError:  # it starts
             return set()
@@ -108,7 +108,7 @@ class Prometheus:
 
 def test_each_alert_is_fired_by_its_cause(tmp_path: Path, brokers: tuple[Broker, Broker]) -> None:
     fleet, away = brokers
-    other_robots = create("mqtt", "others", MqttSettings(host="127.0.0.1", port=fleet.port)).open(5)
+    other_robots = create("mqtt", "others", MqttSettings(host="127.0.0.1", port=fleet.port)).open(WAIT_S)
 
     def beat(name: str) -> bool:
         """Publish heartbeats that take 0.8 s, of this robot and of one that is listed."""

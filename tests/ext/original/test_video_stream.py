@@ -15,7 +15,7 @@ from pebble.contract.payloads import MediaRequest
 from pebble.runtime.parent import ProgramRequest
 from pebble.services.mqtt_bridge.requests.media import Media
 from tests.kit.robot import ProgramRobot
-from tests.support import Broker, gone, until
+from tests.support import WAIT_S, Broker, gone, until
 
 #: Leaves its number and that of a child of its own, and says something.
 STREAMER = """
@@ -46,7 +46,7 @@ class Stream(ProgramRobot):
 
     def pids(self) -> list[int]:
         """The process ids of the program and of what it started."""
-        assert until((self.folder / "pids").exists, 15)
+        assert until((self.folder / "pids").exists)
         return [int(word) for word in (self.folder / "pids").read_text().split()]
 
 
@@ -70,7 +70,7 @@ def test_the_program_ends_with_all_it_started_also_if_it_does_not_want_to(make: 
     pids = stream.pids()
     assert not any(gone(pid) for pid in pids)
     assert stream.process.end() == 0
-    assert until(lambda: all(gone(pid) for pid in pids), 5)
+    assert until(lambda: all(gone(pid) for pid in pids))
     assert f"streaming as pit ''\n{last}" in stream.process.stdout.read() + stream.process.printed
 
 
@@ -78,7 +78,7 @@ def test_a_killed_service_leaves_no_program(make: Make) -> None:
     stream = make(sys.executable, "-c", STREAMER)
     program, child = stream.pids()
     stream.process.kill()
-    assert until(lambda: gone(program), 5)
+    assert until(lambda: gone(program))
     os.kill(child, signal.SIGKILL)  # its own children are its own business then
 
 
@@ -93,7 +93,7 @@ def test_a_program_that_ends_or_never_starts_ends_the_service_with_the_reason(
     make: Make, command: list[str], reason: str
 ) -> None:
     process = make(*command, there=False).process
-    assert process.wait(15) == 1
+    assert process.wait(WAIT_S) == 1
     assert reason in process.printed
 
 

@@ -18,6 +18,7 @@ from pebble.extensions.fleet.people import People, User
 from pebble.extensions.fleet.roles import Role
 from pebble.transports import Message, MqttSettings, create
 from tests.ext.page.served import Page, Served
+from tests.support import WAIT_S
 
 PASSWORDS = {role.value: f"sentinel-password-of-{role.value}" for role in Role}
 
@@ -62,7 +63,7 @@ class Hall:
         """Opens a connection for each request: on one that is kept, an answer may wait for an acknowledgement."""
         headers = {"cookie": self.cookie(name)} if name else {}
         limits = httpx.Limits(max_keepalive_connections=0)
-        return httpx.Client(base_url=self.served.origin, headers=headers, timeout=10, limits=limits)
+        return httpx.Client(base_url=self.served.origin, headers=headers, timeout=WAIT_S, limits=limits)
 
     def socket(self, path: str, *, cookie: str = "", origin: str | None = "") -> ClientConnection:
         """A WebSocket with these headers. Raises InvalidStatus."""

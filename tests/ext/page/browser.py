@@ -16,6 +16,8 @@ from typing import Any, Literal
 import pytest
 from playwright.sync_api import Browser, BrowserContext, CDPSession, Error, Locator, Page, Route, sync_playwright
 
+from tests.support import WAIT_S
+
 Size = Literal["desktop", "phone", "landscape", "small"]
 Theme = Literal["light", "dark"]
 
@@ -88,7 +90,7 @@ class Tab:
     violations: list[str] = field(default_factory=list)  # of the content security policy
     _debugger: CDPSession | None = None
 
-    def until(self, condition: Callable[[], object] | str, timeout: float = 10.0) -> bool:
+    def until(self, condition: Callable[[], object] | str, timeout: float = WAIT_S) -> bool:
         """Wait until ``condition()``, or a JavaScript expression, is true; assert on the result."""
         end = time.monotonic() + timeout
         while not (self.page.evaluate(condition) if isinstance(condition, str) else condition()):
@@ -97,7 +99,7 @@ class Tab:
             self.page.wait_for_timeout(_LOOK_MS)  # not time.sleep: Playwright handles events meanwhile
         return True
 
-    def uncover(self, name: str, within: float = 20.0) -> Locator:
+    def uncover(self, name: str, within: float = WAIT_S) -> Locator:
         """The control of this name, once it is shown; it may be behind a tab of a phone, or folded."""
         found, end = self.page.locator(f'[data-test="{name}"]:visible'), time.monotonic() + within
         while time.monotonic() < end:

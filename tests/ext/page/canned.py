@@ -44,7 +44,7 @@ from pebble.extensions.page.shown import shown
 from pebble.extensions.page.static_files import StaticFiles
 from pebble.transports import MqttSettings
 from tests.ext.page.browser import Size, Tab, tab
-from tests.support import ROOT, free_port, until
+from tests.support import ROOT, WAIT_S, free_port, until
 
 PING_S = 0.5
 PICTURE_S = 0.1
@@ -127,7 +127,7 @@ class CannedServer:
 
     def close(self) -> None:
         self._server.should_exit = self._server.force_exit = True
-        self._thread.join(5)
+        self._thread.join(WAIT_S)
 
     def show(self, state: State) -> None:
         """What pages that connect from now on are shown."""

@@ -14,6 +14,7 @@ from playwright.sync_api import Browser, Error, Locator
 from pebble.transports import Message, MqttSettings, create
 from tests.ext.page.browser import Size, Tab, Theme, tab
 from tests.ext.page.stage import Stage
+from tests.support import SOON_S, WAIT_S
 
 Wheels = tuple[int, int]
 
@@ -29,11 +30,9 @@ KEYS: dict[str, Wheels] = {
     "ArrowLeft": LEFT,
     "ArrowRight": RIGHT,
 }
-REST_S = 1.0  # to come to rest after a release, on a busy machine; 20 ms on an idle one
 QUIET_S = 0.4  # so long nothing may turn where nothing may turn: eight commands of a gesture
-_READY_S = 20.0  # for picture, echoes and lease, on a busy machine
 _PRESSES = 6
-_MOVES_S = 0.7
+_MOVES_S = 3.0
 
 
 @dataclass
@@ -79,7 +78,7 @@ class Console:
             [self.ref if ref is None else ref, metric],
         )
 
-    def because(self, *codes: str, within: float = _READY_S) -> bool:
+    def because(self, *codes: str, within: float = WAIT_S) -> bool:
         """Wait until driving is off for one of these reasons; "" is that it is on."""
         return self.tab.until(lambda: self.reason in codes, within)
 
@@ -92,7 +91,7 @@ class Console:
     def take(self) -> None:
         """Take control; there may be a stop to be reset, or a picture to wait for. Ends with nothing held."""
         self.let_go()
-        end = time.monotonic() + 2 * _READY_S
+        end = time.monotonic() + 2 * WAIT_S
         while not self.because("", within=0.2):
             assert time.monotonic() < end, self.reason
             with suppress(Error):  # the reason has changed meanwhile, and with it the button
@@ -104,18 +103,19 @@ class Console:
             case "stopped":
                 self.reset()
             case "free" | "idle" | "itself":
-                self.test("take").click(timeout=500)
+                self.test("take").click(timeout=2000)
             case "lease":
-                self.test("take-over").hover(timeout=500)
+                self.test("take-over").hover(timeout=2000)
                 self.page.mouse.down()
-                self.because("", "free", "idle", "itself", within=1.5)
+                self.because("", "free", "idle", "itself", within=SOON_S)
                 self.page.mouse.up()
 
     def hold_button(self, name: str, seconds: float = 1.15) -> None:
-        """Press it with the mouse for so long."""
+        """Press it with the mouse for so long; after a second until the page has counted it."""
         self.test(name).hover()
         self.page.mouse.down()
         self.page.wait_for_timeout(1000 * seconds)
+        assert seconds < 1 or self.tab.until(lambda: not self.page.locator(".held").count())
         self.page.mouse.up()
 
     # -- keys
@@ -164,7 +164,7 @@ class Console:
     def speeds(self) -> tuple[float, float]:
         return self.stage.motors(self.name)[-1][1]
 
-    def rests(self, within: float = REST_S) -> bool:
+    def rests(self, within: float = SOON_S) -> bool:
         return self.tab.until(lambda: self.wheels == REST, within)
 
     def stays_at_rest(self, seconds: float = QUIET_S) -> bool:

@@ -68,7 +68,7 @@ def fleet(browser: Browser, stage: Stage) -> Image.Image:
 
 def ready(robot: Console) -> None:
     """Wait for a sharp picture, and take control."""
-    assert robot.tab.until("window.pebble?.video?.info", 20), "no picture has arrived"
+    assert robot.tab.until("window.pebble?.video?.info"), "no picture has arrived"
     robot.take()
     robot.page.wait_for_timeout(1000 * SHARP_S)
 

@@ -17,7 +17,7 @@ from pebble.extensions.page.serve import listen, server_config
 from pebble.extensions.page.setting import WebSettings
 from pebble.transports import MqttSettings
 from tests.kit.played_robot import RecordingRobot
-from tests.support import until
+from tests.support import WAIT_S, until
 
 
 class Served:
@@ -50,12 +50,12 @@ class Served:
 
     def __enter__(self) -> Self:
         self._thread.start()
-        assert until(lambda: self._uvicorn.started, 10), "the server did not start"
+        assert until(lambda: self._uvicorn.started), "the server did not start"
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self._uvicorn.should_exit = True
-        self._thread.join(10)
+        self._thread.join(WAIT_S)
         self.listener.close()
         assert not self._thread.is_alive(), "the server did not end"
 
@@ -87,7 +87,7 @@ class Page:
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
         self.send("hello", version=version or served.version, device=device, name=name)
-        assert until(lambda: self.welcome or self.closed, 30)
+        assert until(lambda: self.welcome or self.closed)
 
     def send(self, op: str, **fields: Any) -> None:
         self._socket.send(json.dumps({"op": op, **fields}))
@@ -100,7 +100,7 @@ class Page:
 
     def take(self, ref: str, *, over: bool = False) -> bool:
         self.send("lease", ref=ref, take=True, over=over)
-        return until(lambda: self.value(ref, "web/driver", "you") is True, 3)
+        return until(lambda: self.value(ref, "web/driver", "you") is True)
 
     def moves(self, robot: RecordingRobot) -> bool:
         """Take control and move the robot; each call is a new gesture."""
@@ -117,13 +117,13 @@ class Page:
         value = self.state.get((ref, metric))
         return value if field is None or value is None else value.get(field)
 
-    def knows(self, ref: str, timeout: float = 5.0) -> bool:
+    def knows(self, ref: str, timeout: float = WAIT_S) -> bool:
         """Whether the component has become online."""
         return until(lambda: self.value(ref, "web/liveness", "online") is True, timeout)
 
     def ready(self) -> bool:
         """Whether enough echoes were exchanged to drive."""
-        return until(lambda: self.state.get(("", "round trip"), -1) >= 0, 3)
+        return until(lambda: self.state.get(("", "round trip"), -1) >= 0)
 
     def close(self) -> None:
         self._socket.close()

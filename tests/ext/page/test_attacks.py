@@ -23,7 +23,7 @@ from pebble.extensions.page import messages as m
 from tests.ext.page.attacker import PASSWORDS, Everything, Hall
 from tests.ext.page.served import Page, Served, now_ms
 from tests.kit.played_robot import RecordingRobot
-from tests.support import Broker, until
+from tests.support import WAIT_S, Broker, until
 
 GOOB = "pebble/robots/goob"
 OWNER = {"owner": "serial", "boot": "00000000", "count": 1}
@@ -118,17 +118,18 @@ def test_a_session_that_is_revoked_while_driving_ends(hall: Hall, broker: Broker
         else:
             headers = {"cookie": cookie, "origin": hall.served.origin}
             assert httpx.post(f"{hall.served.origin}/api/logout", json={}, headers=headers).status_code == 200
-        end = time.monotonic() + 3
-        while time.monotonic() < end and not page.closed:
+
+        def ends() -> bool:
             with suppress(ConnectionClosed):
                 page.drive(base, int(now_ms()), z=0.5)
-            time.sleep(0.05)
-        assert until(lambda: page.closed, 1)
+            return page.closed
+
+        assert until(ends, step=0.05)
         assert page.bye["why"]
-        assert until(lambda: robot.drives()[-1]["z"] == 0, 1), "the wheels stop"
+        assert until(lambda: robot.drives()[-1]["z"] == 0), "the wheels stop"
         if how != "role":
             with pytest.raises(ConnectionClosed):
-                pictures.recv(timeout=3)
+                pictures.recv(timeout=WAIT_S)
             assert hall.refusal("/ws/control", cookie=cookie) == 403
         pictures.close()
 
@@ -228,7 +229,7 @@ def test_what_is_not_understood_ends_the_connection_and_moves_nothing(
         assert page.take(GOOB)
         since = time.monotonic()
         page.send_raw(BAD_MESSAGES[kind])
-        assert until(lambda: page.closed, 3)
+        assert until(lambda: page.closed)
         assert page.bye["why"]
         assert not [one for one in goob.drives(since) if one["x"] or one["z"]]
 
@@ -261,7 +262,11 @@ def test_names_of_robots_are_no_topics(hall: Hall, goob: RecordingRobot, everyth
 def test_a_viewer_does_not_talk(hall: Hall, goob: RecordingRobot) -> None:
     with hall.socket(f"/ws/sound?ref={GOOB}&can=opus", cookie=hall.cookie("viewer")) as talker:
         talker.send(b"\x01" + bytes(648))
-        assert json.loads(talker.recv(timeout=5)) == {"talk": 0, "on": False, "why": "The role viewer may not do this"}
+        assert json.loads(talker.recv(timeout=WAIT_S)) == {
+            "talk": 0,
+            "on": False,
+            "why": "The role viewer may not do this",
+        }
 
 
 ODD_BODIES = [b"", b"[" * 16_000, b'{"op":"estop","ref":"\xff"}', b"x" * 17_000, b'{"user":"\\ud800","password":"x"}']
@@ -285,9 +290,9 @@ def test_odd_bodies_stop_nothing(hall: Hall, everything: Everything, body: bytes
 def test_a_socket_without_hello_is_closed(hall: Hall, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(control, "HELLO_S", 0.3)
     with hall.socket("/ws/control", cookie=hall.cookie("admin")) as silent:
-        assert json.loads(silent.recv(timeout=3))["why"] == "no hello"
+        assert json.loads(silent.recv(timeout=WAIT_S))["why"] == "no hello"
         with pytest.raises(ConnectionClosed):
-            silent.recv(timeout=3)
+            silent.recv(timeout=WAIT_S)
 
 
 def test_a_viewer_ends_no_other_persons_stop(hall: Hall, everything: Everything) -> None:
@@ -299,7 +304,7 @@ def test_a_viewer_ends_no_other_persons_stop(hall: Hall, everything: Everything)
         mallory.send("estop-end", stop="00000000000000ff")
         assert until(lambda: [one["why"] for one in mallory.refused] == ["The role viewer may not do this"])
         before = count()
-        assert until(lambda: count() >= before + 2, 3), "it is no longer sent"
+        assert until(lambda: count() >= before + 2), "it is no longer sent"
         page.send("estop-end", stop="00000000000000ff")
 
 

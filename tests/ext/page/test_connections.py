@@ -37,7 +37,7 @@ def test_held_connections_keep_out_neither_a_person_nor_a_stop(broker: Broker, t
         with hall.client("viewer") as client:
             stopped = client.post("/api/estop", json=STOP | {"ref": robot.base}, headers={"origin": hall.served.origin})
             assert (client.get("/healthz").status_code, stopped.status_code) == (200, 202)
-        assert until(lambda: robot.latched, 5)
+        assert until(lambda: robot.latched)
         page.send("estop", ref=robot.base, stop="00000000000000ff")
         assert until(lambda: page.value(robot.base, "web/estop", "stop") == "00000000000000ff")
         assert not page.closed
@@ -56,7 +56,7 @@ def test_a_connection_without_a_request_is_closed(broker: Broker, monkeypatch: p
         for sent in (b"", b"GET / HTTP/1.1\r\n", UPGRADE):
             held.enter_context(socket.create_connection(("127.0.0.1", served.port), 5)).sendall(sent)
         assert until(lambda: len(served.open) == 3)
-        assert until(lambda: not served.open, 3)
+        assert until(lambda: not served.open)
         assert time.monotonic() - began > 0.4
 
 
@@ -81,7 +81,7 @@ def test_a_client_that_reads_nothing_is_closed(
         client.connect(("127.0.0.1", served.port))
         client.sendall(sent)
         assert until(lambda: len(served.open) == 1)
-        assert until(lambda: not served.open, 10)
+        assert until(lambda: not served.open)
 
 
 @pytest.fixture

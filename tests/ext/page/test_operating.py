@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import time
 from collections.abc import Callable, Coroutine
 from typing import Any, cast
 
@@ -37,7 +36,7 @@ def publish(broker: Broker, topic: str, payload: bytes, *, retain: bool = False)
 # -- logs
 
 
-def test_a_page_that_reads_logs_receives_those_from_before_and_those_that_come(page, robot) -> None:
+def test_a_page_that_reads_logs_receives_those_from_before_and_those_that_come(served, page, robot) -> None:
     def logged(text: str) -> bool:
         """Publish until the server receives it: it subscribes a moment after the page has opened the robot."""
         robot.publish("logs", {"message": text})
@@ -45,9 +44,7 @@ def test_a_page_that_reads_logs_receives_those_from_before_and_those_that_come(p
         return page.value(robot.base, "status", "value") == text
 
     page.send("watch", ref=robot.base)
-    assert until(lambda: logged("first"))
-    time.sleep(0.5)  # by then it has subscribed to the logs, too
-    assert until(lambda: logged("first"))
+    assert until(lambda: logged("first") and served.app.state.robots.logs[robot.base].after(0))
     assert page.logs == []  # it has not asked
     page.send("read-logs", ref=robot.base, on=True)
     assert until(lambda: lines(page))

@@ -47,7 +47,7 @@ def archive(broker: Broker, folder: Path) -> Iterator[Served]:
     with Served(broker.port, recordings=folder) as running:
         yield running
         pids = running.app.state.recordings.process.pids
-    assert until(lambda: all(map(gone, pids)), 5)
+    assert until(lambda: all(map(gone, pids)))
 
 
 def get(served: Served, path: str, **parameters: Any) -> httpx.Response:
@@ -323,7 +323,7 @@ def test_all_but_seek_play_and_speed_ends_it(served: Served, data: str | bytes) 
 
 def test_processes_are_few_and_end_with_their_sockets(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     processes = served.app.state.recordings.viewers.processes
-    assert until(lambda: not processes, 10)
+    assert until(lambda: not processes)
     monkeypatch.setattr(viewers, "MOST", 2)
     with Viewer(served) as one, Viewer(served) as two:
         assert one.until(one.shown)
@@ -332,8 +332,8 @@ def test_processes_are_few_and_end_with_their_sockets(served: Served, monkeypatc
         with Viewer(served) as third:
             assert third.until(lambda: third.bye.startswith("2 pages look at recordings already"))
         next(iter(processes)).kill()
-        assert one.until(lambda: one.bye, 2) or two.until(lambda: two.bye, 2)
-    assert until(lambda: not processes and all(map(gone, pids)), 10)
+        assert until(lambda: one.until(lambda: one.bye, 1) or two.until(lambda: two.bye, 1))
+    assert until(lambda: not processes and all(map(gone, pids)))
 
 
 def test_a_page_without_a_question_gets_none(served: Served) -> None:

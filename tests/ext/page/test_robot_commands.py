@@ -219,13 +219,13 @@ def test_every_command_reaches_the_robot_in_its_order_and_is_in_the_audit(
 
     for fields, *_ in PUBLISHED:
         page.send(ref=robot.base, **fields)
-    assert until(lambda: len(asked_of(robot)) == len(PUBLISHED), 5), asked_of(robot)
+    assert until(lambda: len(asked_of(robot)) == len(PUBLISHED)), asked_of(robot)
     assert asked_of(robot) == [row[1:] for row in PUBLISHED]
     assert page.refused == []
     retained: list[Message] = []
     with create("mqtt", "later", MqttSettings(host="127.0.0.1", port=broker.port)) as later:
         later.subscribe(f"{robot.base}/incoming/#", retained.append, direct=True)
-        assert until(lambda: len(retained) == 3, 3)
+        assert until(lambda: len(retained) == 3)
     assert {one.topic.rpartition("/")[2] for one in retained} == {"remote-mirror", "mqtt-audio", "mqtt-video"}
     assert until(lambda: len(noted()) == len(PUBLISHED) - 1), (noted(), page.closed)  # two lights are "on"
     assert noted()[:3] == ["lights: on", "lights: off", "soundboard: file a/horn.wav, repeat False"]
@@ -233,7 +233,7 @@ def test_every_command_reaches_the_robot_in_its_order_and_is_in_the_audit(
 
 
 def refusals(page: Page, expected: int = 1) -> list[str]:
-    assert until(lambda: len(page.refused) >= expected, 3)
+    assert until(lambda: len(page.refused) >= expected)
     return [one["why"] for one in page.refused]
 
 
@@ -247,7 +247,7 @@ def test_without_driving_nothing_is_moved_or_switched_on(served: Served, robot: 
         assert all("load it again" in why for why in refusals(page, len(moving)))
         page.send("autonomy", ref=robot.base, file="")
         page.send("outlet", ref=robot.base, outlet="o1", on=False)
-        assert until(lambda: len(asked_of(robot)) == 2, 3), asked_of(robot)
+        assert until(lambda: len(asked_of(robot)) == 2), asked_of(robot)
 
 
 BEYOND: list[Fields] = [

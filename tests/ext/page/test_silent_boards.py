@@ -16,7 +16,7 @@ from pebble.transports import MqttSettings, QoS, create
 from tests.ext.page.attacker import Hall
 from tests.ext.page.served import Page, Served
 from tests.kit.played_robot import RecordingRobot
-from tests.support import Broker, until
+from tests.support import WAIT_S, Broker, until
 
 _NAMES = itertools.count(1)
 
@@ -114,7 +114,7 @@ def test_the_config_allows_forbids_or_leaves_it_to_people(
 def test_a_retained_command_blocks_until_it_is_cleared(broker: Broker, board: RecordingRobot, tmp_path: Path) -> None:
     ref = board.base
     parked = create("mqtt", "parker", MqttSettings(host="127.0.0.1", port=broker.port))
-    parked.open(timeout=5)
+    parked.open(timeout=WAIT_S)
     assert parked.publish(f"{ref}/incoming/drive-values", b'{"z": 1.0}', qos=QoS.DELIVERED, retain=True)
     parked.close()
     with Hall(broker.port, tmp_path, listed={ref: ListedRobot(drive=True)}) as hall, hall.page("driver") as page:

@@ -56,7 +56,7 @@ def talks(opened: Tab) -> bool:
         assert opened.until(opened.test("talk").is_enabled)
         opened.test("talk").hover()
         opened.page.mouse.down()
-        if opened.until(lambda: state(opened).lower() == "goob plays your voice.", 8):
+        if opened.until(lambda: state(opened).lower() == "goob plays your voice."):
             return True
         opened.page.mouse.up()
         opened.page.wait_for_timeout(200)
@@ -74,14 +74,14 @@ def test_a_page_plays_the_robots_sound_and_the_robot_the_voice_until_the_page_st
     with tab(browser, f"{goob.url}r/{goob.ref('goob')}") as opened:
         opened.uncover("listen").click()
         opened.uncover("sound-state")
-        assert opened.until(lambda: "ms buffered · opus" in state(opened), 20)
+        assert opened.until(lambda: "ms buffered · opus" in state(opened))
         opened.page.evaluate(TAP)
-        assert opened.until("loudest > 0.02", 20)
+        assert opened.until("loudest > 0.02")
         assert talks(opened)
         assert opened.page.evaluate("pebble.sound.model.speaker.gain.gain.value") == 0  # else it would come back
-        assert opened.until(lambda: np.abs(np.frombuffer(played(goob), "<i2").astype(int)).max(initial=0) > 1000, 20)
+        assert opened.until(lambda: np.abs(np.frombuffer(played(goob), "<i2").astype(int)).max(initial=0) > 1000)
         opened.freeze()
-        assert until(falls_silent, 6)
+        assert until(falls_silent)
         opened.thaw()
         opened.page.mouse.up()
         assert opened.errors + opened.violations == []

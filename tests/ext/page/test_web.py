@@ -26,7 +26,7 @@ from pebble.extensions.operator.client import page_packages
 from pebble.extensions.page import run as process
 from pebble.extensions.page.setting import WebSettings, settings_of
 from tests.commands.command_line import Run, config_file, program
-from tests.support import ROOT, Broker, Child, free_port
+from tests.support import ROOT, WAIT_S, Broker, Child, free_port
 
 SECRET = "sentinel-8472"
 BROKER = {"services": {"mqtt_bridge": {"remote_mqtt": {"host": "broker.example"}}}}
@@ -242,7 +242,7 @@ def test_it_serves_https_with_a_certificate_of_ones_own_until_ctrl_c(run: Run, b
     with urllib.request.urlopen(f"{url}ca.pem", context=trusting) as response:
         assert response.read() == authority, "what else is in the file is not shown"
     process.send_signal(signal.SIGINT)
-    assert (process.communicate(timeout=10)[1], process.returncode) == ("", 130)
+    assert (process.communicate(timeout=WAIT_S)[1], process.returncode) == ("", 130)
 
 
 # -- a process of a robot
@@ -350,7 +350,7 @@ def test_it_reports_that_it_is_ready_and_alive_and_ends_by_a_signal(tmp_path: Pa
     os.close(writer)
     with os.fdopen(reader) as notes:
         assert [json.loads(notes.readline())["note"] for _ in range(3)] == ["ready", "alive", "alive"]
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=5) as answer:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=WAIT_S) as answer:
             assert answer.status == 200
         page.terminate()
-        assert page.wait(5) == 0
+        assert page.wait(WAIT_S) == 0

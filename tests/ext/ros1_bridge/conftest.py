@@ -55,14 +55,14 @@ class World:
         self.start(
             "master", *(real if self.partner == "debian" else (str(HERE / "scripted.py"), "master", str(self.port)))
         )
-        assert until(lambda: listening(self.port), 20)
+        assert until(lambda: listening(self.port))
 
     def start_base(self) -> int:
         """Start a base; returns when it was up, in nanoseconds of the monotonic clock."""
         begin = time.monotonic_ns()
         program = "rospy_base.py" if self.partner == "debian" else "scripted.py"
         self.start("base", str(HERE / program), "base", "husky_base", self.uri, str(self.log))
-        assert until(lambda: self.rows(begin, "up"), 20)
+        assert until(lambda: self.rows(begin, "up"))
         return self.rows(begin, "up")[0][0]
 
     def kill(self, name: str, number: int = signal.SIGKILL) -> None:
@@ -75,7 +75,7 @@ class World:
         path = Path(f"{self.log}.do")
         path.with_suffix(".new").write_text(line)
         path.with_suffix(".new").rename(path)
-        assert until(lambda: not path.exists(), 5)
+        assert until(lambda: not path.exists())
 
     def rows(self, since: int = 0, kind: str = "cmd") -> list[Row]:
         """Return what the base has noted since then."""
@@ -120,9 +120,11 @@ class Husky:
         return self
 
     def ready(self) -> Husky:
-        """Start, and wait until the base hears it and is heard."""
+        """Start, and wait until the base hears it, and has heard its first zero, and is heard."""
+        heard = len(self.ros.rows())
         self.start()
-        assert until(lambda: self.bridge.assess() == ("ready", 0, ""), 10), self.bridge.assess()
+        assert until(lambda: self.bridge.assess() == ("ready", 0, "")), self.bridge.assess()
+        assert until(lambda: len(self.ros.rows()) > heard)
         return self
 
     def send(self, **drive: Any) -> int:
@@ -137,14 +139,19 @@ class Husky:
             time.sleep(0.05)
         return last
 
+    def is_obeyed(self) -> bool:
+        """Drive until the base moves."""
+        begin = time.monotonic_ns()
+        return until(lambda: self.drive(0.1) and self.ros.moves(begin))
+
     def stop_it(self) -> None:
         self.world.command("estop", {"by": "ann"})
-        assert self.world.became("estop/ros1", 5, latched=True)
+        assert self.world.became("estop/ros1", latched=True)
 
     def reset(self) -> None:
         state = self.world.newest("estop/ros1")
         self.world.command("estop-reset", {"boot": state["boot"], "count": state["count"]})
-        assert self.world.became("estop/ros1", 5, latched=False)
+        assert self.world.became("estop/ros1", latched=False)
 
     def end(self) -> None:
         self.running.stop()

@@ -84,7 +84,7 @@ def test_doctor_says_whether_anything_would_obey(ros: World) -> None:
     def states(uri: str, **more: Any) -> list[State]:
         return [result.state for result in checks(read({"enabled": True, "ros": {"master_uri": uri, **more}}))]
 
-    assert until(lambda: states(ros.uri) == [State.OK], 5)
+    assert until(lambda: states(ros.uri) == [State.OK])
     assert states(ros.uri, cmd_vel_topic="/nowhere") == [State.WARN]
     ros.kill("master")
     assert states(ros.uri) == [State.FAILED]

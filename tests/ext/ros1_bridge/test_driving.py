@@ -6,6 +6,7 @@ import signal
 import socket
 import threading
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,7 @@ from pebble.services.ros1_bridge.messages import GOAL_ID, GOAL_STATUS, TWIST
 from pebble.services.ros1_bridge.node import Node
 from pebble.services.ros1_bridge.xmlrpc_api import call, serve
 from tests.ext.ros1_bridge.conftest import Husky, World
-from tests.support import until
+from tests.support import WAIT_S, until
 
 TOPIC = "/cmd_vel"
 
@@ -28,7 +29,7 @@ def node_of(ros: World, name: str = "pebble_ros1_bridge") -> Node:
 
 
 def registered(node: Node) -> bool:
-    return until(lambda: node.registered, 5)
+    return until(lambda: node.registered)
 
 
 def test_a_command_becomes_a_twist_and_ends_in_zeros_then_silence(
@@ -38,21 +39,21 @@ def test_a_command_becomes_a_twist_and_ends_in_zeros_then_silence(
     monkeypatch.delattr(Config, "section")  # a search through the whole config, longer than the rest of a command
     begin = time.monotonic_ns()
     last = husky.send(x=0.5, z=1.0)
-    assert until(lambda: husky.ros.moves(begin), 2)
+    assert until(lambda: husky.ros.moves(begin))
     assert husky.ros.moves(begin)[0][2] == ["0.600000", "-0.600000"]
-    assert until(lambda: husky.ros.zeros(begin), 3)
+    assert until(lambda: len(husky.ros.zeros(begin)) >= 5)
     first = (husky.ros.zeros(begin)[0][0] - last) / 1e9
     assert 0.6 < first < 1.6, "0.75 s after the last command, on a machine that is not busy"
     time.sleep(0.6)
     assert husky.ros.moves(husky.ros.zeros(begin)[0][0]) == []
-    assert 5 <= len(husky.ros.zeros(begin)) <= 7
+    assert len(husky.ros.zeros(begin)) <= 7
     count = len(husky.ros.rows(begin))
     time.sleep(0.3)
     assert len(husky.ros.rows(begin)) == count, "other programs of ROS may drive"
     assert husky.world.newest("wheel-odometry")["unit"] == "mm"
     newest = husky.world.newest
-    assert until(lambda: newest("diagnostics").get("value", {}).get("label") == "OK", 5)
-    assert until(lambda: newest("navigation-status").get("value", {}).get("label") == "UNKNOWN", 5)
+    assert until(lambda: newest("diagnostics").get("value", {}).get("label") == "OK")
+    assert until(lambda: newest("navigation-status").get("value", {}).get("label") == "UNKNOWN")
 
 
 def test_its_sender_stops_the_base_although_the_service_hangs(ros: World) -> None:
@@ -62,18 +63,18 @@ def test_its_sender_stops_the_base_although_the_service_hangs(ros: World) -> Non
     node.start()
     sender.open()
     try:
-        assert until(lambda: sender.bases, 5)
+        assert until(lambda: sender.bases)
         begin = time.monotonic_ns()
         sender.drive(0.4, 0.0, 0.3)
-        assert until(lambda: ros.zeros(begin) and ros.moves(begin), 2)
-        assert until(lambda: ros.zeros(ros.moves(begin)[-1][0]), 2)
+        assert until(lambda: ros.zeros(begin) and ros.moves(begin))
+        assert until(lambda: ros.zeros(ros.moves(begin)[-1][0]))
         assert (ros.zeros(ros.moves(begin)[-1][0])[0][0] - begin) / 1e9 < 1.0
         assert len(ros.moves(begin)) <= 6, "once, then every 0.05 s"
         begin = time.monotonic_ns()
         sender.drive(0.4, 0.0, 5.0)
-        assert until(lambda: ros.moves(begin), 2)
+        assert until(lambda: ros.moves(begin))
         sender.drive(float("nan"), 0.0, 5.0)
-        assert until(lambda: ros.zeros(begin), 2)
+        assert until(lambda: ros.zeros(begin))
         time.sleep(0.4)
         assert ros.moves(ros.zeros(begin)[0][0]) == []
     finally:
@@ -90,7 +91,7 @@ def test_the_service_stops_the_base_although_its_sender_hangs(
     monkeypatch.setattr(CmdVel, "alive", True)
     husky = Husky(ros, tmp_path).ready()
     begin = husky.send(z=0.5)
-    assert until(lambda: husky.ros.zeros(begin + 10_000_000), 3)
+    assert until(lambda: husky.ros.zeros(begin + 10_000_000))
     assert len(husky.ros.moves(begin)) <= 1
     husky.end()
 
@@ -102,41 +103,38 @@ def test_a_stopped_base_gets_zeros_the_lock_and_no_goal_also_after_a_restart(hus
     begin = time.monotonic_ns()
     husky.stop_it()
     husky.drive(1.0)
-    stopped = husky.ros.zeros(begin)[0][0]
-    assert husky.ros.moves(stopped) == []
-    assert len(husky.ros.zeros(stopped)) >= 5
+    assert until(lambda: len(husky.ros.locks(begin)) >= 5), "it is repeated"
     assert set(husky.ros.locks(begin)) == {"True"}
-    assert len(husky.ros.locks(begin)) >= 5, "it is repeated"
+    stopped = husky.ros.zeros(begin)[0][0]
+    assert until(lambda: len(husky.ros.zeros(stopped)) >= 5)
+    assert husky.ros.moves(stopped) == []
     assert husky.ros.rows(begin, "cancel")
     again = time.monotonic_ns()
-    for _ in range(40):
-        husky.bridge.halt()
-        time.sleep(0.02)
-    assert len(husky.ros.locks(again)) >= 4, "who stops it again and again does not keep the lock waiting"
+    locks = partial(husky.ros.locks, again)
+    assert until(lambda: husky.bridge.halt() or len(locks()) > 3, step=0.02), "who stops it again delays no lock"
     husky.end()
     again = time.monotonic_ns()
     husky.ready()
     husky.drive(0.3)
-    assert until(lambda: "True" in husky.ros.locks(again), 3)
+    assert until(lambda: "True" in husky.ros.locks(again))
     assert husky.ros.rows(again)[0] in husky.ros.zeros(again)
     reset = time.monotonic_ns()
     husky.reset()
-    assert until(lambda: husky.ros.locks(reset)[-1:] == ["False"], 2)
+    assert until(lambda: husky.ros.locks(reset)[-1:] == ["False"])
     time.sleep(0.6)
     assert husky.ros.moves(stopped) == []
-    husky.drive(0.3)
-    assert husky.ros.moves(reset)
+    assert husky.is_obeyed()
 
 
 def test_a_new_base_hears_a_zero_first_and_a_lock_while_it_is_stopped(husky: Husky) -> None:
     """Rule 3, while it is driven; then rule 4, with a bridge that is killed before the lock is open."""
     done = threading.Event()
-    driver = threading.Thread(target=lambda: [husky.drive(0.2) for _ in range(100) if not done.is_set()])
+    driver = threading.Thread(target=lambda: [husky.drive(0.2) for _ in iter(done.is_set, True)])
     driver.start()
     try:
         husky.ros.kill("base")
         up = husky.ros.start_base()
-        assert until(lambda: husky.ros.moves(up), 5), "and then it is driven"
+        assert until(lambda: husky.ros.moves(up)), "and then it is driven"
         assert husky.ros.rows(up)[0] in husky.ros.zeros(up)
     finally:
         done.set()
@@ -144,22 +142,22 @@ def test_a_new_base_hears_a_zero_first_and_a_lock_while_it_is_stopped(husky: Hus
     husky.stop_it()
     husky.ros.kill("base")
     up = husky.ros.start_base()
-    assert until(lambda: husky.ros.locks(up), 15)
+    assert until(lambda: husky.ros.locks(up))
     assert set(husky.ros.locks(up)) == {"True"}
     husky.ros.kill("base")
     lock = husky.bridge.cmd_vel._lock  # whose connection may end later than that of the commands
-    assert until(lambda: husky.bridge.assess()[0] == "absent" and not lock.names, 5)
+    assert until(lambda: husky.bridge.assess()[0] == "absent" and not lock.names)
     husky.reset()
     husky.end()
     husky.start()
     up = husky.ros.start_base()
-    assert until(lambda: husky.ros.locks(up), 15), "an earlier life has locked it"
+    assert until(lambda: husky.ros.locks(up)), "an earlier life has locked it"
     assert set(husky.ros.locks(up)) == {"False"}
     husky.end()
     husky.ready()
     husky.ros.kill("base")
     up = husky.ros.start_base()
-    assert until(lambda: husky.ros.rows(up), 5)
+    assert until(lambda: husky.ros.rows(up))
     time.sleep(0.3)
     assert husky.ros.locks(up) == [], "who has locked nothing in this life opens nothing"
 
@@ -169,13 +167,13 @@ def test_a_person_who_drives_cancels_navigation(ros: World, tmp_path: Path, canc
     """Rule 5: a multiplexer may prefer the planner."""
     husky = Husky(ros, tmp_path, drive={"cancels_navigation": cancels}).ready()
     ros.do("goal active")
-    assert until(lambda: husky.world.newest("navigation-status").get("value", {}).get("active"), 5)
-    assert until(lambda: husky.world.newest("navigation-goal").get("value", {}).get("x_m") == 1.0, 5)
+    assert until(lambda: husky.world.newest("navigation-status").get("value", {}).get("active"))
+    assert until(lambda: husky.world.newest("navigation-goal").get("value", {}).get("x_m") == 1.0)
     for drive, cancelled in ((Drive(z=0.5, source="autonomy", run=1), False), (Drive(z=0.5), cancels)):
         begin = time.monotonic_ns()
         for _ in range(3):
             husky.bridge.move(drive, 0.2)
-        assert until(lambda begin=begin: ros.rows(begin, "cancel"), 0.5) is cancelled  # type: ignore[misc]
+        assert until(lambda begin=begin: ros.rows(begin, "cancel"), WAIT_S if cancelled else 0.5) is cancelled  # type: ignore[misc]
         assert len(ros.rows(begin, "cancel")) <= 1, "once a second"
     husky.end()
 
@@ -184,17 +182,15 @@ def test_a_base_that_sends_no_odometry_any_more_gets_no_moves(husky: Husky) -> N
     """Rule 6: what it hears after it hung would be old."""
     husky.drive(0.3)
     husky.ros.do("quiet")
-    assert until(lambda: husky.bridge.assess()[0] == "absent", 3)
+    assert until(lambda: husky.bridge.assess()[0] == "absent")
     assert "no odometry" in husky.bridge.assess()[2]
     begin = time.monotonic_ns()
     husky.drive(0.5)
     assert husky.ros.moves(begin) == []
-    assert husky.bridge.cmd_vel.held_back
+    assert until(lambda: husky.bridge.cmd_vel.held_back)
     husky.ros.do("loud")
-    assert until(lambda: husky.bridge.assess() == ("ready", 0, ""), 3)
-    begin = time.monotonic_ns()
-    husky.drive(0.3)
-    assert husky.ros.moves(begin)
+    assert until(lambda: husky.bridge.assess() == ("ready", 0, ""))
+    assert husky.is_obeyed()
 
 
 def test_a_subscriber_that_is_not_connected_is_told_again(ros: World) -> None:
@@ -219,7 +215,7 @@ def test_a_subscriber_that_is_not_connected_is_told_again(ros: World) -> None:
     heard = threading.Event()
     node.subscribe("/move_base/status", GOAL_STATUS, lambda _body: heard.set())
     node.start()
-    assert until(lambda: any(uri.startswith(node.uri) and uri != node.uri for uri in told), 8), told
+    assert until(lambda: any(uri.startswith(node.uri) and uri != node.uri for uri in told)), told
     ros.kill("base")
     heard.clear()
     ros.start_base()
@@ -229,17 +225,16 @@ def test_a_subscriber_that_is_not_connected_is_told_again(ros: World) -> None:
     hung.close()
 
 
-def test_of_two_bridges_with_one_name_the_second_waits(husky: Husky) -> None:
+def test_of_two_bridges_with_one_name_the_second_waits(husky: Husky, caplog: pytest.LogCaptureFixture) -> None:
     """Rule 8: to register ends the other, which would register again, and so on."""
     second = node_of(husky.ros)
     CmdVel(second, TOPIC, 0.05, None, None)
     second.start()
-    assert until(lambda: second.problem.startswith("another node is called"), 5)
-    begin = time.monotonic_ns()
-    husky.drive(1.5)
+    assert until(lambda: second.problem.startswith("another node is called"))
+    assert husky.is_obeyed(), "the first one drives on"
+    husky.drive(1.0)
     assert not second.registered
-    assert len(husky.ros.moves(begin)) > 12, "the first one drives on"
-    assert husky.ros.zeros(begin) == []
+    assert "has ended this node" not in caplog.text
     husky.end()
     assert registered(second), "its name is free"
     second.close()
@@ -251,33 +246,29 @@ def test_a_node_that_is_ended_halts_and_returns_once_its_name_is_free(husky: Hus
     husky.drive(0.3)
     begin = husky.drive(0.2)
     call(husky.bridge.node.uri, "shutdown", "/master", "new node registered with same name")
-    assert until(lambda: husky.ros.zeros(begin), 1)
+    assert until(lambda: husky.ros.zeros(begin))
     state, _, why = husky.bridge.assess()
     assert (state, "has ended this node" in why) == ("absent", True)
-    assert until(lambda: husky.bridge.assess()[0] == "ready", 6)
-    begin = time.monotonic_ns()
-    husky.drive(0.3)
-    assert husky.ros.moves(begin)
+    assert until(lambda: husky.bridge.assess()[0] == "ready")
+    assert husky.is_obeyed()
     other = node_of(husky.ros, "teleop")
     other.advertise(TOPIC, TWIST, "")
     other.advertise("/move_base/cancel", GOAL_ID, "")  # as each client of a planner does
     other.start()
     named = ("ready", 0, "others publish /cmd_vel as well: /teleop")
-    assert until(lambda: husky.bridge.assess() == named, 5), "rule 9"
+    assert until(lambda: husky.bridge.assess() == named), "rule 9"
     other.close()
 
 
 def test_a_master_that_is_killed_and_comes_back_is_registered_with_again(husky: Husky) -> None:
     husky.ros.kill("master")
-    assert until(lambda: not husky.bridge.node.registered, 5)
-    begin = time.monotonic_ns()
-    husky.drive(0.4)
-    assert husky.ros.moves(begin), "open connections stay"
+    assert until(lambda: not husky.bridge.node.registered)
+    assert husky.is_obeyed(), "open connections stay"
     husky.ros.start_master()
-    assert until(lambda: husky.bridge.node.registered, 5)
+    assert until(lambda: husky.bridge.node.registered)
     husky.ros.kill("base")
     up = husky.ros.start_base()
-    assert until(lambda: husky.ros.rows(up), 5)
+    assert until(lambda: husky.ros.rows(up))
     assert husky.ros.rows(up)[0] in husky.ros.zeros(up)
 
 
@@ -285,10 +276,10 @@ def test_a_base_that_hung_hears_few_old_moves_and_then_a_zero(husky: Husky) -> N
     husky.drive(0.5)
     husky.ros.kill("base", signal.SIGSTOP)
     husky.drive(2.5)
-    assert husky.bridge.assess()[0] == "absent"
+    assert until(lambda: husky.bridge.assess()[0] == "absent")
     begin = time.monotonic_ns()
     husky.ros.kill("base", signal.SIGCONT)
-    assert until(lambda: husky.ros.zeros(begin), 3)
+    assert until(lambda: husky.ros.zeros(begin))
     burst = [row for row in husky.ros.moves(begin) if row[0] < husky.ros.zeros(begin)[0][0]]
     assert len(burst) < 70, "of the second before it was taken for hung"
 
@@ -300,19 +291,17 @@ def test_strangers_are_bounded_and_keep_nobody_out(husky: Husky) -> None:
     silent = [socket.create_connection(("127.0.0.1", port)) for _ in range(40)]
     api = int(node.uri.rsplit(":", 1)[1].strip("/"))
     callers = [socket.create_connection(("127.0.0.1", api)) for _ in range(20)]
-    assert until(lambda: {"ros_greetings", "ros_calls"} <= node.dropped().keys(), 5), node.dropped()
-    begin = time.monotonic_ns()
-    husky.drive(0.3)
-    assert husky.ros.moves(begin), "who is connected is driven"
+    assert until(lambda: {"ros_greetings", "ros_calls"} <= node.dropped().keys()), node.dropped()
+    assert husky.is_obeyed(), "who is connected is driven"
     for sock in silent:
-        sock.settimeout(5)
+        sock.settimeout(WAIT_S)
         assert sock.recv(1) == b""
     for sock in callers:
         sock.close()
-    assert until(lambda: registered(node) and call(node.uri, "getPid", "/x"), 5)
+    assert until(lambda: registered(node) and call(node.uri, "getPid", "/x"))
     for greeting, answer in ((b"\x10\x00\x00\x00\x0c\x00\x00\x00topic=/other", b"error="), (b"\xff\xff\xff\xff", b"")):
         with socket.create_connection(("127.0.0.1", port)) as sock:
-            sock.settimeout(5)
+            sock.settimeout(WAIT_S)
             sock.sendall(greeting)
             received = sock.recv(1000)
             assert (answer in received, bool(answer)) == (True, bool(received))

@@ -22,7 +22,7 @@ from pebble.extensions.thin.expander import Expander
 from pebble.extensions.thin.packed import joined, packed
 from pebble.transports import MqttSettings, QoS, Transport, create
 from tests.ext.fleet.brokers import HOST, FleetBroker
-from tests.support import ROOT, Broker, Child, free_port, until
+from tests.support import ROOT, WAIT_S, Broker, Child, free_port, until
 
 BASE = "pebble/robots/goob"
 STREAMS = {"touch-sensors": b'{"value": {"a0": 1}}', "wheel-odometry": b'{"value": {"x": 1.50}}'}
@@ -37,7 +37,7 @@ def command(broker: Broker) -> Iterator[None]:
         yield
     finally:
         process.terminate()
-        process.wait(10)
+        process.wait(WAIT_S)
 
 
 @contextmanager
@@ -50,7 +50,7 @@ def page(broker: Broker) -> Iterator[None]:
         yield
     finally:
         loop.call_soon_threadsafe(task.cancel)
-        thread.join(10)
+        thread.join(WAIT_S)
 
 
 def _run(loop: asyncio.AbstractEventLoop, task: asyncio.Task[None]) -> None:
@@ -61,18 +61,18 @@ def _run(loop: asyncio.AbstractEventLoop, task: asyncio.Task[None]) -> None:
 @pytest.mark.parametrize("beside", [command, page])
 def test_plain_topics_come_of_groups(broker: Broker, beside: Callable[[Broker], Iterator[None]]) -> None:
     seen: dict[str, bytes] = {}
-    robot = create("mqtt", "robot", MqttSettings(host="127.0.0.1", port=broker.port)).open(10)
+    robot = create("mqtt", "robot", MqttSettings(host="127.0.0.1", port=broker.port)).open(WAIT_S)
     robot.subscribe(f"{BASE}/#", lambda message: seen.update({message.topic: message.payload}), qos=QoS.DELIVERED)
     wire = b'{"group_hz": 2, "dict_id": 3, "dict": "%s"}' % TEXT.replace(b'"', b'\\"')
     robot.publish(f"{BASE}/outgoing/wire", wire, qos=QoS.DELIVERED, retain=True)
     with beside(broker):  # type: ignore[attr-defined]
-        assert until(lambda: f"{BASE}/incoming/expander" in seen, 30)
+        assert until(lambda: f"{BASE}/incoming/expander" in seen)
 
         def comes() -> bool:
             robot.publish(f"{BASE}/outgoing/group", packed(TEXT, 3, TEXT), qos=QoS.LATEST)
             return until(lambda: all(seen.get(f"{BASE}/outgoing/{metric}") for metric in STREAMS), 1)
 
-        assert until(comes, 20)
+        assert until(comes)
     assert {metric: seen[f"{BASE}/outgoing/{metric}"] for metric in STREAMS} == STREAMS
     robot.close()
 
@@ -112,5 +112,5 @@ def test_at_a_fleets_broker_it_has_an_account_of_its_own(
                 lambda: f"{BASE}/outgoing/wheel-odometry" in seen and b'"short":"~/goob"' in b"".join(said), 0.3
             )
 
-        assert until(arrives, 20 if comes else 1) is comes
+        assert until(arrives, WAIT_S if comes else 1) is comes
         assert bool(said) is comes, "it is not even said that it is there"

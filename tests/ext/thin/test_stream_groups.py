@@ -15,6 +15,7 @@ from pebble.extensions.thin.packed import MOST_BYTES, joined, packed, unpacked
 from pebble.transports import Message, QoS
 from tests.forwarding.virtual import Connection, World
 from tests.services.mqtt_bridge.bridge_rig import make_config
+from tests.support import WAIT_S
 
 TOUCH, IMU, ODOMETRY, WIRE, STREAMS = (
     "outgoing/touch-sensors",
@@ -45,7 +46,7 @@ class Beside:
     def __init__(self, world: World, id_: str = "5") -> None:
         self.world = world
         self.connection = Connection(f"expander-{id_}", world.remote_hub, world)
-        self.connection.open(10)
+        self.connection.open(WAIT_S)
         self.expander = Expander(self.connection, clock=lambda: world.now, id_=id_)
         self.expander.start()
         world.run(0.1)
@@ -219,7 +220,7 @@ def test_a_short_name_is_used_while_an_expander_hears_it(start: Start, claimed: 
     expander = Beside(world)
     if claimed:
         other = Connection("another", world.remote_hub, world)
-        other.open(10)
+        other.open(WAIT_S)
         wire = b'{"group_hz": 1, "short": "~/3f"}'
         other.publish("pebble/robots/another/outgoing/wire", wire, qos=QoS.DELIVERED, retain=True)
     number = run(world, 6, expander)

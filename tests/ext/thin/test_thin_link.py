@@ -13,7 +13,7 @@ from pebble.runtime.connections import local_transport
 from pebble.services.mqtt_bridge.service import MqttBridge
 from tests.robot.operator import Operator
 from tests.services.mqtt_bridge.bridge_rig import BASE, Running, make_config
-from tests.support import Broker, until
+from tests.support import SOON_S, Broker, until
 
 IMU, STOP, ONLINE, LINK = "outgoing/sensors/imu", "incoming/estop", "outgoing/online", "outgoing/link"
 FLOOD = 3_000
@@ -44,8 +44,8 @@ def test_a_stop_passes_at_once_while_much_waits(brokers: list[Broker]) -> None:
     assert until(lambda: robot.last(STOP))
     stopped = robot.last(STOP)
     assert stopped is not None
-    assert stopped.at - began < 5.0, "a deadline for a slow machine"
-    assert until(lambda: json.loads((operator.last(IMU) or stopped).payload).get("n") == FLOOD - 1, 30)
+    assert stopped.at - began < SOON_S
+    assert until(lambda: json.loads((operator.last(IMU) or stopped).payload).get("n") == FLOOD - 1)
     arrived = [one for one in operator.seen if one.topic.endswith("imu")]
     assert len(arrived) < FLOOD / 50
     heartbeats = [one.at for one in operator.seen if one.topic.endswith(ONLINE)]

@@ -18,7 +18,7 @@ from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.transports import Message, QoS, State, Transport
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.kit.robot import Running as Running
-from tests.support import until
+from tests.support import WAIT_S, until
 
 BASE = "pebble/robots/rover"
 
@@ -57,7 +57,7 @@ class Client:
         self.transport, self.base = transport, base
         self.seen: list[Message] = []
         self.probes: list[Message] = []
-        transport.open(10)
+        transport.open(WAIT_S)
         assert transport.state is State.CONNECTED, transport.problem
         if listen:
             transport.subscribe(f"{base}/#", self._remember, echo=False, direct=True)
@@ -124,7 +124,7 @@ class Quiet:
     def __init__(self, *clients: Client) -> None:
         self._clients = clients
 
-    def wait(self, seconds: float = 0.3, timeout: float = 10.0) -> None:
+    def wait(self, seconds: float = 0.3, timeout: float = WAIT_S) -> None:
         """Until no client has seen anything but heartbeats for ``seconds``: a loop never lets it return."""
         end = time.monotonic() + timeout
         before, since = self._count(), time.monotonic()

@@ -25,7 +25,7 @@ from pebble.transports import Message, QoS
 from pebble.transports.memory import MemoryTransport
 from tests.forwarding.virtual import World
 from tests.services.mqtt_bridge.bridge_rig import BASE, Client, MemoryRig
-from tests.support import until
+from tests.support import WAIT_S, until
 
 TRUE, FALSE = b'{"value": true}', b'{"value": false}'
 ON, OFF = b'{"enabled": true}', b'{"enabled": false}'
@@ -192,7 +192,9 @@ class TestHeartbeat:
 
         rig.remote.transport.subscribe(f"{BASE}/outgoing/online", press)
         rig.bridge()
-        assert until(lambda: PRESS in rig.local.payloads(STOP), 3)
+        assert until(lambda: PRESS in rig.local.payloads(STOP))
+        rig.close()
+        assert b'"online":false' in rig.remote_hub.retained[f"{BASE}/outgoing/online"].payload
 
 
 class TestUrgency:
@@ -223,14 +225,14 @@ class TestUrgency:
 
         def hold(_topic: str) -> bool:
             held.set()
-            return over.wait(10)
+            return over.wait(WAIT_S)
 
         holding = partial(bridge.forwarder.retained.remove, Side.REMOTE, f"{BASE}/{STATE}", unless=hold)
         threading.Thread(target=holding, daemon=True).start()
-        assert held.wait(5)
+        assert held.wait(WAIT_S)
         rig.remote.publish(STOP, PRESS, retain=retain)
         rig.remote.publish(MIRROR_FLAG, b"true", retain=True)
-        assert until(lambda: rig.local.payloads(STOP) == [PRESS], 5)
+        assert until(lambda: rig.local.payloads(STOP) == [PRESS])
         assert not rig.local.on(MIRROR_FLAG)
         over.set()
         assert until(lambda: rig.local.on(MIRROR_FLAG))

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import logging
 import sys
+import threading
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ from pebble.contract import CHANNELS, GIT_PULL, REBOOT, Kind
 from pebble.runtime.parent import Notifier
 from pebble.services.mqtt_bridge.motor_owners import MotorOwners
 from pebble.services.mqtt_bridge.requests.actions import ACTIONS, Action, Row
-from pebble.services.mqtt_bridge.requests.earlier_names import EarlierNames
+from pebble.services.mqtt_bridge.requests.earlier_names import CallIn, EarlierNames
 from pebble.services.mqtt_bridge.vouching import Vouching
 from pebble.transports import Answer, Transport
 from pebble.transports.memory import MemoryHub, MemoryTransport
@@ -165,6 +167,8 @@ def test_refused_while_it_runs(make: Callable[..., Action], tmp_path: Path) -> N
     action = make(*PYTHON, f"import os\nwhile not os.path.exists({str(gate)!r}): pass")
     assert action.request()
     assert not action.request()
+    follows = [thread.daemon for thread in threading.enumerate() if thread.name == f"action {action.name}"]
+    assert follows == [True], "a bridge ends before the command that restarts it does"
     gate.touch()
     assert until(lambda: not action.running)
     assert finished(action)
@@ -322,10 +326,13 @@ def test_a_damaged_file_removes_nothing(robot: Named, text: str) -> None:
 def test_a_bridge_looks_for_them_once_it_forwards(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    begun: list[EarlierNames] = []
-    monkeypatch.setattr(EarlierNames, "begin", lambda names: begun.append(names))
+    begun, later = list[float](), list[CallIn]()
+    jobs = [(wait_s, partial(begun.append, wait_s)) for wait_s in (60.0, 0.0)]
+    monkeypatch.setattr(EarlierNames, "__init__", lambda _names, _config, _sides, call_in: later.append(call_in))
+    monkeypatch.setattr(EarlierNames, "begin", lambda _names: begun or [later[0](*job) for job in jobs])
     rig = MemoryRig(monkeypatch)
     rig.bridge()
-    assert until(lambda: begun, 5)
+    assert until(lambda: begun)
+    assert begun[0] == 0.0, "what is to be done in a minute waits"
     rig.close()
     assert "failed at the bridge" not in caplog.text

@@ -293,3 +293,7 @@ def test_without_a_bridge_all_time_counts() -> None:
     own = vouched_lease(None)
     perform(own, ((0, "hold", ANN), (2.999, "vouch", 2, 2.999), (2.999, "ann"), (2.999, "doubt"), (3, "")))
     assert own.vouched is None
+    assert not own.refuses(True, False, "", "", 3000)  # a stranger's
+    own.changed = False
+    own.tick(5000)
+    assert (own.others, own.changed) == (False, True)

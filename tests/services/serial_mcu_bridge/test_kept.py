@@ -24,7 +24,7 @@ from pebble.motors.state_file import StateFile, Unreadable
 from pebble.services.serial_mcu_bridge.text.hall_memory import HallMemory
 from pebble.transports import State
 from tests.kit.hall_reader import HallReader
-from tests.support import until
+from tests.support import WAIT_S, until
 
 
 class Saved:
@@ -54,7 +54,7 @@ def test_only_the_newest_of_many_values_is_written_and_closing_waits_for_it(
     dumps, written = json.dumps, []
 
     def slowly(value: Any) -> str:
-        assert may_write.wait(5)
+        assert may_write.wait(WAIT_S)
         written.append(value)
         return dumps(value)
 

@@ -29,7 +29,7 @@ from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.kit.hall_reader import HallReader
 from tests.kit.robot import BASE as BASE
 from tests.kit.robot import ROBOT, Listener, Running, handled
-from tests.support import Broker, RefusingBroker, errors, until
+from tests.support import WAIT_S, Broker, RefusingBroker, errors, until
 
 STOP = {"stop": "c9a9f10cc9a9f10c", "by": "eve", "why": "a test"}
 STOPPED = "M 0.000 0.000"
@@ -86,7 +86,7 @@ class Bench:
         before = len(self.lines)
         self.service = self._new_service()
         self.running = Running(self.service)
-        assert until(lambda: len(self.lines) >= before + 2, 5)  # the stop after opening and after booting
+        assert until(lambda: len(self.lines) >= before + 2)  # the stop after opening and after booting
 
     @property
     def lines(self) -> list[str]:
@@ -113,7 +113,7 @@ class Bench:
         return self.world.payloads(metric)
 
     def line(self, text: str) -> bool:
-        return until(lambda: text in self.lines, 5)
+        return until(lambda: text in self.lines)
 
     @property
     def state(self) -> dict[str, Any]:
@@ -122,11 +122,11 @@ class Bench:
         return state
 
     def stopped(self) -> bool:
-        return until(lambda: self.state.get("latched") and self.state["persisted"], 5)
+        return until(lambda: self.state.get("latched") and self.state["persisted"])
 
     def reset(self) -> bool:
         self.send("estop-reset", {"boot": self.state["boot"], "count": self.state["count"], "by": "eve"})
-        return until(lambda: not self.state["latched"], 5)
+        return until(lambda: not self.state["latched"])
 
     def stop(self) -> None:
         self.running.stop()
@@ -136,7 +136,7 @@ class Bench:
         boot = self.state.get("boot")
         self.stop()
         self.start()
-        assert until(lambda: self.state.get("boot") not in (boot, None), 5)
+        assert until(lambda: self.state.get("boot") not in (boot, None))
 
     def close(self) -> None:
         self.stop()
@@ -161,10 +161,10 @@ def test_the_configured_watchdog_stops_once(bench: Bench) -> None:
     sent = time.monotonic()
     assert bench.moves(0.5)
     moved = next(entry for entry in bench.mcu.trace.entries() if entry.line == "M 0.500 0.500")
-    assert until(lambda: bench.lines[-1] == STOPPED, 2)
+    assert until(lambda: bench.lines[-1] == STOPPED)
     stopped = bench.mcu.trace.entries()[-1]
     assert stopped.ns / 1e9 - sent >= 0.2
-    assert (stopped.ns - moved.ns) / 1e9 <= 0.5  # the default is 0.75
+    assert (stopped.ns - moved.ns) / 1e9 < 0.65  # the default is 0.75
     time.sleep(0.3)  # one more timeout: the stop is not repeated
     assert bench.mcu.trace.entries()[-1] == stopped
 
@@ -207,14 +207,14 @@ def test_a_second_program_at_the_port_is_named_until_it_has_gone(
 @pytest.mark.parametrize("bench", [FRED], indirect=True)
 def test_every_field_of_a_line_is_published_and_what_the_motors_get_again_while_they_run(bench: Bench) -> None:
     """An odometry that begins while a robot drives steadily learns in which direction."""
-    assert until(lambda: bench.payloads("touch-sensors") and bench.payloads("charging-status"), 5)
+    assert until(lambda: bench.payloads("touch-sensors") and bench.payloads("charging-status"))
     assert set(bench.payloads("touch-sensors")[0]["value"]) == {"a0", "a1", "a2"}
     bench.mcu.charge(True)
-    assert until(lambda: bench.payloads("charging-status")[-1] == {"value": True}, 5)
+    assert until(lambda: bench.payloads("charging-status")[-1] == {"value": True})
     assert bench.payloads("charging-status") == [{"value": False}, {"value": True}], "changes alone are published"
-    assert until(lambda: bench.drive(0.5) or len(bench.payloads("motor-power/serial")) >= 3, 5)
+    assert until(lambda: bench.drive(0.5) or len(bench.payloads("motor-power/serial")) >= 3)
     assert {tuple(power.values()) for power in bench.payloads("motor-power/serial")} == {(0.5, 0.5)}
-    assert until(lambda: bench.payloads("motor-power/serial")[-1] == {"left": 0.0, "right": 0.0}, 5)
+    assert until(lambda: bench.payloads("motor-power/serial")[-1] == {"left": 0.0, "right": 0.0})
 
 
 def test_a_drive_command_without_an_axis_is_logged_once_for_each_sender(
@@ -253,31 +253,31 @@ def test_robots_with_one_state_directory_do_not_share_a_stop(tmp_path: Path) -> 
 def test_a_stop_that_is_repeated_for_another_listed_owner_is_ignored(tmp_path: Path) -> None:
     bench = Bench(tmp_path, "goob", instance="left", peer="right")
     try:
-        assert until(lambda: bench.world.on("estop/left"), 5)
+        assert until(lambda: bench.world.on("estop/left"))
         bench.send("estop", {"stop": "a" * 16, "owner": "right"})
         bench.send("control", ANN)  # judged after it
-        assert bench.world.became("control/left", 5, by="ann")
+        assert bench.world.became("control/left", by="ann")
         assert not bench.state["latched"]
         for number, owner in enumerate(({"owner": "left"}, {"owner": "else"}, {}), start=1):
             bench.send("estop", {"stop": f"{number:016x}", **owner})
-            assert bench.world.became("estop/left", 5, latched=True, count=number)
+            assert bench.world.became("estop/left", latched=True, count=number)
     finally:
         bench.close()
 
 
 def test_a_drive_command_that_waited_renews_control_before_the_silence_counts(bench: Bench) -> None:
     bench.send("control", {**ANN, "for_ms": 1000})
-    assert bench.world.became("control/serial", 5, by="ann")
+    assert bench.world.became("control/serial", by="ann")
     key, began = bench.world.newest("control/serial")["key"], time.monotonic()
     assert until(lambda: time.monotonic() > began + 1.1)
     blocked, go_on, counters = threading.Event(), threading.Event(), bench.service.transport.counters
 
     def stand_still() -> None:
         blocked.set()
-        go_on.wait(5)
+        go_on.wait(WAIT_S)
 
     bench.service.post(stand_still)
-    assert blocked.wait(5)
+    assert blocked.wait(WAIT_S)
     delivered = counters["delivered"]
     bench.drive(0.5, key=key)
     vouched = b'{"from": 0, "to": %d}' % (1000 * time.monotonic())
@@ -454,7 +454,7 @@ def test_a_bridge_keeps_every_line_of_its_board_whether_or_not_it_publishes_them
     path = Path("/dev/shm") / f"pebble-test-{os.getpid()}-{time.monotonic_ns()}"
     bench = Bench(tmp_path, "goob", odometry_shm={"name": path.name})
     try:
-        assert until(lambda: is_whole(path), 3)
+        assert until(lambda: is_whole(path))
         reader = HallReader(path.name)
         assert until(lambda: reader.newest >= 20)
         samples = reader.read()

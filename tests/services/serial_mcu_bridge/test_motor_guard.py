@@ -20,7 +20,7 @@ from pebble.motors.control import Control
 from pebble.motors.motor_guard import MotorGuard
 from pebble.motors.state_file import StateFile
 from pebble.transports.counters import Counters
-from tests.support import until
+from tests.support import WAIT_S, until
 
 A, B = "00000000000000aa", "00000000000000bb"
 SCRIPT = Drive(z=0.5, source="autonomy", run=7)
@@ -241,7 +241,7 @@ def test_a_write_that_takes_long_is_not_repeated_until_it_has_ended(
     """Else a disk that takes longer than the pause between two attempts would never have the newest state."""
     may_end = threading.Event()
     sync = os.fsync
-    monkeypatch.setattr(os, "fsync", lambda file: may_end.wait(10) and sync(file))
+    monkeypatch.setattr(os, "fsync", lambda file: may_end.wait(WAIT_S) and sync(file))
     rig.stop()
     assert until(path.parent.exists)
     path.write_text("{}")  # nor for what appears meanwhile

@@ -15,7 +15,7 @@ from pebble.extensions.lab.simulation.pty import PtyMcu
 from pebble.services.serial_mcu_bridge.line.port import Port
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState, SerialLine
 from pebble.services.serial_mcu_bridge.text.goob_base import STOP, drive_line
-from tests.support import cases, until
+from tests.support import SOON_S, cases, until
 
 STOPPED = "M 0.000 0.000"
 
@@ -240,13 +240,23 @@ def fill(host: Host) -> float:
     return longest
 
 
+def test_old_commands_of_a_killed_host_are_thrown_away(connect: Connect) -> None:
+    with closing(StuckDevice()) as stuck:
+        killed = Port(str(stuck.path), 460800)
+        assert killed.write(drive_line(0.3, 0.3) * 600) == 8400
+        killed.close()
+        assert until(connect(stuck.path, boot_s=0.05).is_ready)
+        assert until(lambda: stuck.seen().endswith(b"\n" + STOP + STOP))
+        assert len(stuck.seen()) < 5000
+
+
 def test_a_stuck_reader_does_not_block_and_finds_no_old_commands_later_and_the_stop_at_the_end(
     connect: Connect,
 ) -> None:
     with closing(StuckDevice()) as stuck:
         host = connect(stuck.path, boot_s=0.05)
         assert until(host.is_ready)
-        assert fill(host) < 0.5
+        assert fill(host) < SOON_S
         assert until(lambda: LineState.ABSENT in host.states, step=0.001)
         assert len(stuck.seen()) < 5000
         assert until(lambda: host.states.count(LineState.READY) == 2)

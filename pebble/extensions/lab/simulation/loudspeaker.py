@@ -6,7 +6,6 @@ it began, and as it ended.
 """
 
 import argparse
-import fcntl
 import os
 import signal
 import sys
@@ -24,7 +23,6 @@ from pebble.extensions.lab.simulation.trace import complete_lines
 _CHUNK_S = 0.02
 _DELAY_LIMIT_S = 0.1  # a delay is made up for, but no more of it than this
 _EVENTS = "events.jsonl"
-_BUSY = "loudspeaker: audio open error: Device or resource busy"
 
 
 class Playback(msgspec.Struct, omit_defaults=True):
@@ -149,16 +147,10 @@ def main(arguments: list[str]) -> int:
         try:
             if folder is not None:
                 folder.mkdir(parents=True, exist_ok=True)
-            if folder is not None and options.exclusive:
-                device = resources.enter_context((folder / "device").open("ab"))
-                fcntl.flock(device, fcntl.LOCK_EX | fcntl.LOCK_NB)
             sound = _open(options, resources)
             complete = _play(sound, _Recorder(sound, folder, resources))
         except _StoppedError:
             complete = False
-        except BlockingIOError:
-            sys.stderr.write(f"{_BUSY}\n")
-            return 1
         except (OSError, EOFError, wave.Error) as error:
             sys.stderr.write(f"loudspeaker: {options.file}: {error}\n")
             return 1
@@ -169,7 +161,6 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m pebble.simulation.loudspeaker", description=__doc__)
     parser.add_argument("file", help="a WAV file, or - for standard input")
     parser.add_argument("--record", type=Path, metavar="FOLDER", help="for events.jsonl, and a WAV file of each sound")
-    parser.add_argument("--exclusive", action="store_true", help="play one sound at a time, as without a mixer")
     parser.add_argument("-t", "--file-type", choices=("wav", "raw"), default="wav")
     parser.add_argument("-f", "--format", choices=("S16_LE",), default="S16_LE")
     parser.add_argument("-c", "--channels", type=int, default=1)

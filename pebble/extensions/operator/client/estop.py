@@ -116,7 +116,7 @@ class RobotStop:
         if not self.estop.has_capabilities:
             return "it has not published its capabilities" if self.live else "nothing was received: it may be off"
         if not self.estop.available:
-            if self.estop.zeros:
+            if self.estop.zeros:  # topics of motors to which a stop sends zeros
                 return _ZEROS
             return "its broker refuses emergency stops, so it gets zeros" if self.estop.drives else "it does not drive"
         if not self.estop.owners:

@@ -141,7 +141,7 @@ class DrivenRobot:
     # -- what is known
 
     @property
-    def keeps(self) -> bool:
+    def keeps_control(self) -> bool:
         """True if the robot itself decides who drives it. Otherwise this server does, for its own pages."""
         robot = self._view()
         return robot is not None and robot.controlled
@@ -184,7 +184,8 @@ class DrivenRobot:
     def shown(self, tab: Tab, now: float) -> DriverView:
         """Return the view of the driver for this page."""
         wish, state = self._wishes.get(tab), self.published
-        view = DriverView(keeps=self.keeps, asking=wish is not None and wish.client.wanted and not wish.client.held)
+        asking = wish is not None and wish.client.wanted and not wish.client.held
+        view = DriverView(keeps=self.keeps_control, asking=asking)
         if state is not None:
             asks = (state.asks or "somebody") if state.asks_id else ""
             view = replace(view, asks=asks, checked=state.named, others=state.others)  # named: the broker checks names
@@ -241,7 +242,7 @@ class DrivenRobot:
         commands: list[Command] = []
         for tab, wish in list(self._wishes.items()):
             commands += self._follow_wish(tab, wish, now)
-        if self.client is None and self.keeps:  # it decides now itself: control that this server has given is void
+        if self.client is None and self.keeps_control:  # from now on: control that this server has given is void
             commands += self._on(Event.LOST, now)
         self._changed.add(self.ref)
         return commands

@@ -26,7 +26,7 @@ from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.ext.av.media_rig import BASE, MediaProgram, client
 from tests.kit.robot import Running
 from tests.kit.sound import best_match
-from tests.support import Broker, until
+from tests.support import WAIT_S, Broker, until
 
 # Appends what it hears to a file that is named after how it was called.
 RECORDER = """
@@ -125,7 +125,7 @@ def test_received_speech_is_played_and_garbage_and_retained_packets_are_not(
 ) -> None:
     packet = make_sound_encoder("pcm", rate=16000, channels=1).encode(bytes(640), 1000)[0]
     operator.send(packet, retain=True)
-    robot = receive(device="plug:x", latency_ms=600)
+    robot = receive(device="plug:x", latency_ms=1000)
     for size in range(200):
         operator.send(bytes(range(256))[:size])
         operator.send(packet[:size])
@@ -173,7 +173,7 @@ def test_another_player_begins_after_a_change_of_format_and_when_it_dies_or_hang
     assert until(lambda: len(recorder.calls) == 4 and len(recorder.samples(3)) > 3000)
     assert recorder.calls == ["16000-1-default", "48000-2-default", "16000-1-default", "16000-1-default"]
     robot.process.send_signal(signal.SIGTERM)
-    assert robot.process.wait(5) == 0
+    assert robot.process.wait(WAIT_S) == 0
 
 
 def test_a_player_that_is_not_installed_is_named_once(receive: Receive, operator: Operator) -> None:

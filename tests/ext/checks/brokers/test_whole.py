@@ -18,7 +18,7 @@ from pebble.extensions.checks.broker.probes import judge
 from pebble.transports import MqttSettings
 from pebble.transports.mqtt.transport import MqttTransport
 from tests.commands.command_line import Run, running
-from tests.support import ROOT, Broker, further, until
+from tests.support import ROOT, WAIT_S, Broker, further, until
 from tests.transports.brokers import MAKERS
 from tests.transports.net import Received
 
@@ -118,7 +118,7 @@ def test_what_it_retains_is_removed_when_it_is_interrupted(broker: Broker) -> No
         with running("doctor", "--broker", f"mqtt://127.0.0.1:{broker.port}", stdout=subprocess.DEVNULL) as process:
             assert until(lambda: len(retained()) > 50, 60)
             process.send_signal(signal.SIGINT)
-            assert process.wait(30) == 130
+            assert process.wait(WAIT_S) == 130
         assert until(lambda: retained() == {})
 
 

@@ -29,7 +29,7 @@ from pebble.extensions.operator.places import mosquitto_path
 from tests.commands.command_line import Run
 from tests.ext.fleet.broker_client import BrokerClient, Place
 from tests.kit.terminal import Terminal
-from tests.support import ROOT, Child, free_port, listening, until
+from tests.support import ROOT, WAIT_S, Child, free_port, listening, until
 
 PAGE = (ROOT / "docs/ext/fleet.md").read_text()
 #: The first block of the page: what a newcomer types, one after the other.
@@ -58,11 +58,11 @@ def mosquitto(conf: Path, port: int) -> Iterator[None]:
     with (conf.parent / "log").open("ab") as log:
         process = Child([str(mosquitto_path()), "-c", str(conf)], cwd=conf.parent.parent, stdout=log, stderr=log)
     try:
-        assert until(lambda: listening(port), 10), (conf.parent / "log").read_text()
+        assert until(lambda: listening(port)), (conf.parent / "log").read_text()
         yield
     finally:
         process.kill()
-        process.wait(10)
+        process.wait(WAIT_S)
 
 
 @pytest.mark.parametrize("level", ["login", "named"])
@@ -96,9 +96,9 @@ def test_the_first_page_as_a_newcomer_types_it(
             with closing(Terminal(*python("pebble.cli", *shlex.split(drive)[1:]), cwd=tmp_path)) as console:
                 assert console.sees("ready"), console.shown
                 console.hold(b"w")
-                assert until(lambda: robot.listen(0.05) or any(MOVES.search(one) for _, one in robot.received), 20)
+                assert until(lambda: robot.listen(0.05) or any(MOVES.search(one) for _, one in robot.received))
             assert "stopped and confirmed" in shown_by(stop)
-            assert until(lambda: robot.listen(0.05) or any(b'"latched":true' in one for _, one in robot.received), 5)
+            assert until(lambda: robot.listen(0.05) or any(b'"latched":true' in one for _, one in robot.received))
         for line in later:
             shown_by(line)
     assert list(passwords) == ["goob", "fred", "minilamp", "ann", "otto"]
@@ -122,7 +122,7 @@ def typed(line: str, folder: Path) -> Iterator[None]:
         yield
     finally:
         process.terminate()
-        process.wait(10)
+        process.wait(WAIT_S)
 
 
 def _merged(piece: dict[str, Any], folder: Path) -> Path:

@@ -16,6 +16,7 @@ from pebble.extensions.install.flash import ports, uf2
 from pebble.extensions.install.flash.boards import ESP32_C6, ESP8266, SAMD21, Board
 from pebble.extensions.install.flash.images import check_image
 from pebble.extensions.install.flash.on_board import check_answer
+from tests.support import WAIT_S
 
 
 def esp(chip: int) -> bytes:
@@ -116,7 +117,7 @@ def test_the_user_is_asked_to_reset_a_board_that_does_not_listen(
     uninterruptible: UninterruptibleBoard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ports, "_AUTOMATIC_S", 0.3)
-    ports.break_in(uninterruptible.port, uninterruptible.ask, pulse=True, timeout_s=10)
+    ports.break_in(uninterruptible.port, uninterruptible.ask, pulse=True, timeout_s=WAIT_S)
     assert len(uninterruptible.asked) == 1
     assert "press its reset button" in uninterruptible.asked[0]
 

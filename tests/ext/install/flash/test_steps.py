@@ -27,7 +27,7 @@ from pebble.extensions.install.flash.sources import firmware_folder, modules
 from pebble.extensions.install.flash.steps import FlashOptions, execute, show_steps
 from pebble.extensions.install.flash.tools import Tools
 from tests.firmware.micropython import SCRIPTS, VM
-from tests.support import Child
+from tests.support import WAIT_S, Child
 
 
 class NodeBoard:
@@ -57,7 +57,7 @@ class NodeBoard:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self._process.kill()
-        self._process.wait(10)
+        self._process.wait(WAIT_S)
         os.close(self._slave)
 
 

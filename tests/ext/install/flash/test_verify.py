@@ -18,7 +18,7 @@ from pebble.extensions.install.flash import verify
 from pebble.extensions.install.flash.boards import FIRMWARE
 from pebble.extensions.install.flash.verify import at_broker, on_serial_port
 from tests.commands.conftest import broker as broker
-from tests.support import Broker, beside, free_port
+from tests.support import WAIT_S, Broker, beside, free_port
 
 TOPIC = "pebble/robots/lamp/outgoing/online"
 
@@ -30,7 +30,7 @@ def config(port: int) -> Config:
 
 def publish(broker: Broker, payload: str, *options: str) -> None:
     command = ["mosquitto_pub", "-p", str(broker.port), "-t", TOPIC, "-m", payload, *options]
-    subprocess.run(command, check=True, timeout=10)
+    subprocess.run(command, check=True, timeout=WAIT_S)
 
 
 def test_a_retained_heartbeat_and_a_will_are_ignored(broker: Broker) -> None:
@@ -50,7 +50,7 @@ def test_a_live_heartbeat_counts_even_without_the_time_of_day(broker: Broker) ->
             publish(broker, '{"t": 3250, "online": true}', "-r")
 
     with beside(send_heartbeats, done):
-        assert at_broker(config(broker.port), timeout_s=5) == "the robot is online"
+        assert at_broker(config(broker.port), timeout_s=WAIT_S) == "the robot is online"
 
 
 def test_an_unreachable_broker_is_reported_as_this_machines_problem(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -91,7 +91,7 @@ def test_a_report_on_the_line_counts_and_other_bytes_are_shown(
     timer = threading.Timer(0.3, os.write, (line[1], sent))
     timer.start()
     if is_report:
-        assert on_serial_port(line[0], FIRMWARE[robot], timeout_s=5) == "the robot sends reports"
+        assert on_serial_port(line[0], FIRMWARE[robot], timeout_s=WAIT_S) == "the robot sends reports"
     else:
         with pytest.raises(DeviceError, match=f"no report from {robot} within 0.6 s; received b'"):
             on_serial_port(line[0], FIRMWARE[robot], timeout_s=0.6)

@@ -41,7 +41,7 @@ class Robot:
         unit = ("--unit=board", "--uid=pebble", "--gid=pebble", *FOLDERS)
         board = ("sim", "goob", "--link", PORT, "--trace", TRACE)
         self.machine.run("systemd-run", "--quiet", *unit, "--", "/opt/pebble/a/bin/pebble", *board)
-        assert until(lambda: self.machine.succeeds("test", "-e", PORT), 30, step=0.1)
+        assert until(lambda: self.machine.succeeds("test", "-e", PORT), step=0.1)
 
     def configure(self, config: dict[str, Any] = CONFIG) -> None:
         """Write its config as ``pebble setup`` leaves it: readable by the robot's group."""

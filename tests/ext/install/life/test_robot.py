@@ -71,8 +71,8 @@ def test_a_robot_with_media_drives_stops_shows_and_sounds(machine: Machine) -> N
     assert robot.receives("outgoing/audio")
     assert not robot.board.turning()
     robot.send("incoming/drive-values", {"x": 0, "z": 0.5})
-    assert until(robot.board.motors, 10, step=0.1), "it drives"
-    assert until(lambda: not robot.board.turning(), 10, step=0.1), "it stops without further commands"
+    assert until(robot.board.motors, step=0.1), "it drives"
+    assert until(lambda: not robot.board.turning(), step=0.1), "it stops without further commands"
     status = machine.sh("cat /proc/$(systemctl show --value --property=MainPID pebble.service)/status")
     assert "Seccomp:\t2" in status
     assert "CapBnd:\t0000000000000000" in status

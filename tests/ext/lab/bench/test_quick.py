@@ -16,7 +16,7 @@ from pebble.extensions.lab.bench.impair.network import why_no_namespaces
 from pebble.extensions.lab.bench.report import SECTIONS, Section
 from pebble.extensions.lab.bench.results import load
 from pebble.extensions.lab.rig.processes import children
-from tests.support import ROOT, gone, until
+from tests.support import ROOT, WAIT_S, gone, until
 
 
 def command(name: str, *options: str) -> list[str]:
@@ -71,16 +71,16 @@ def test_ctrl_c_leaves_nothing(temporary: Path) -> None:
         env={**os.environ, "TMPDIR": str(temporary)}, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
     try:
-        assert until(lambda: len(children(bench.pid)) == 2, 20)
+        assert until(lambda: len(children(bench.pid)) == 2)
         started = children(bench.pid)
-        assert until(lambda: all(map(segments, started)), 20)
+        assert until(lambda: all(map(segments, started)))
         shared = set().union(*map(segments, started))
         time.sleep(1)  # files younger than a second are not swept
         bench.send_signal(signal.SIGINT)
-        assert bench.wait(20) == 130
+        assert bench.wait(WAIT_S) == 130
     finally:
         bench.kill()
         bench.wait()
-    assert until(lambda: all(map(gone, started)), 5)
+    assert until(lambda: all(map(gone, started)))
     assert not any(segment.exists() for segment in shared)
     assert list(temporary.iterdir()) == [temporary / "results"]

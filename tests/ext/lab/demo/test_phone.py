@@ -21,7 +21,7 @@ from pebble.extensions.lab.demo.main import run
 from pebble.extensions.lab.demo.phone import NAME, Phone, qr_lines
 from pebble.extensions.lab.rig.processes import end_all
 from pebble.extensions.lab.rig.testbed import PageServer
-from tests.support import Broker
+from tests.support import WAIT_S, Broker
 
 
 def test_the_code_is_read_as_the_address() -> None:
@@ -62,7 +62,9 @@ def login(url: str, password: str, authority: Path) -> int:
     body = json.dumps({"user": NAME, "password": password}).encode()
     request = urllib.request.Request(f"{url}api/login", body, headers)
     try:
-        with urllib.request.urlopen(request, timeout=10, context=ssl.create_default_context(cafile=authority)) as one:
+        with urllib.request.urlopen(
+            request, timeout=WAIT_S, context=ssl.create_default_context(cafile=authority)
+        ) as one:
             return int(one.status)
     except urllib.error.HTTPError as error:
         return error.code

@@ -11,13 +11,13 @@ import serial
 from pebble.errors import DeviceError
 from pebble.extensions.lab.simulation.pty import PtyMcu
 from pebble.extensions.lab.simulation.trace import read_trace
-from tests.support import until
+from tests.support import WAIT_S, until
 
 
 def test_a_host_talks_to_it_and_everything_is_traced_in_time(tmp_path: Path) -> None:
     with PtyMcu("goob", tmp_path / "port", trace=tmp_path / "trace", trace_output=True) as mcu:
         before = time.monotonic_ns()
-        with serial.Serial(str(mcu.symlink), 460800, timeout=5) as port:
+        with serial.Serial(str(mcu.symlink), 460800, timeout=WAIT_S) as port:
             port.write(b"M 0.5 0.25\nL 1 ")
             assert until(lambda: "M 0.5 0.25" in mcu.trace.lines())
             port.write(b"0 0\r\n")
@@ -59,8 +59,8 @@ def test_the_program(tmp_path: Path) -> None:
 
     with subprocess.Popen(command, stdin=subprocess.PIPE, text=True, bufsize=1) as program:
         assert program.stdin is not None
-        assert until(symlink.exists, 20)
-        with serial.Serial(str(symlink), 115200, timeout=5) as port:
+        assert until(symlink.exists)
+        with serial.Serial(str(symlink), 115200, timeout=WAIT_S) as port:
             port.write(b"M 1 1\n")
             assert until(lambda: (0.93, 1.0) in {entry.motors for entry in read_trace(trace)})
             program.stdin.write("charge\nnonsense\n")
@@ -70,7 +70,7 @@ def test_the_program(tmp_path: Path) -> None:
         program.stdin.write("replug\n")
         assert until(lambda: events().count("plugged") == 2)
         program.stdin.close()
-        assert program.wait(10) == 0
+        assert program.wait(WAIT_S) == 0
     assert [entry.line for entry in read_trace(trace) if entry.event == "line"] == ["M 1 1"]
     assert not symlink.is_symlink()
 

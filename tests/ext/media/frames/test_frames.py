@@ -26,7 +26,7 @@ from pebble.transports.peers import prepare_run_dir
 from pebble.transports.segments import SHM
 from tests.ext.media.frames.frames_peer import Options
 from tests.locking import needs_shared_memory
-from tests.support import needs_root, until
+from tests.support import WAIT_S, needs_root, until
 from tests.transports.forked import Forked
 
 SMALL = 160 * 120 * 3  # to be shared all the same
@@ -47,7 +47,7 @@ class Peer:
         answer: dict[str, Any] = json.loads(self._line())
         return answer
 
-    def reaches(self, condition: Callable[[dict[str, Any]], object], timeout: float = 10.0) -> dict[str, Any]:
+    def reaches(self, condition: Callable[[dict[str, Any]], object], timeout: float = WAIT_S) -> dict[str, Any]:
         """Ask until ``condition`` is true for an answer, and return that."""
         answers: list[dict[str, Any]] = [{}]
 
@@ -68,7 +68,7 @@ class Peer:
 
     def kill(self) -> None:
         self._process.kill()
-        self._process.wait(10)
+        self._process.wait(WAIT_S)
         for pipe in (self._process.stdin, self._process.stdout):
             with suppress(BrokenPipeError):
                 pipe.close()
@@ -119,7 +119,7 @@ def test_a_slow_reader_gets_the_newest(tmp_path: Path) -> None:
         for number in range(10):
             assert writer.write(bytes([number]) * 640, FrameInfo())
         assert until(lambda: reader.counters["received"] == 10)
-        frame = reader.read(5)
+        frame = reader.read(WAIT_S)
         assert frame is not None
         assert (frame.data[0], reader.counters["skipped"]) == (9, 9)
 
@@ -129,7 +129,7 @@ def test_a_deep_reader_gets_them_all_in_order_and_small_frames_travel_as_bytes(t
         assert until(lambda: writer.wanted)
         for number in range(100):
             assert writer.write(bytes([number]) * 640, FrameInfo())
-        frames = [reader.read(5) for _ in range(100)]
+        frames = [reader.read(WAIT_S) for _ in range(100)]
         assert [frame is not None and (frame.data[0], frame.shared) for frame in frames] == [
             (number, False) for number in range(100)
         ]
@@ -145,7 +145,7 @@ def test_readers_and_writers_that_are_killed_are_noticed_and_their_segments_swep
     def all_receive(life: int) -> None:
         for reader in readers:
             before = reader.ask().get("frames", 0)
-            reader.reaches(lambda seen, before=before: seen["frames"] > before, 3)
+            reader.reaches(lambda seen, before=before: seen["frames"] > before)
             assert (reader.ask()["writers"], reader.ask()["wrong"]) == (life, 0)
 
     all_receive(1)
@@ -160,7 +160,7 @@ def test_readers_and_writers_that_are_killed_are_noticed_and_their_segments_swep
         reader.kill()
     writer.reaches(lambda printed: not printed["wanted"])
     writer.kill()
-    assert until(lambda: segments.sweep() >= 0 and not any(path.exists() for path in used), 5)
+    assert until(lambda: segments.sweep() >= 0 and not any(path.exists() for path in used))
 
 
 def test_there_is_one_writer_at_a_time(tmp_path: Path) -> None:
@@ -202,7 +202,7 @@ def test_a_process_that_ends_with_an_open_writer_or_reader_ends(tmp_path: Path) 
         "folder = Path(sys.argv[1]); w = FrameWriter(folder, 'camera', capacity=1 << 20).open()\n"
         "r = FrameReader(folder, 'camera').open(); r.read(0.2); raise SystemExit(3)"
     )
-    assert subprocess.run([sys.executable, "-c", program, str(tmp_path)], timeout=20, check=False).returncode == 3
+    assert subprocess.run([sys.executable, "-c", program, str(tmp_path)], timeout=WAIT_S, check=False).returncode == 3
 
 
 def test_a_fork_of_a_writer_or_reader_may_not_use_it(tmp_path: Path) -> None:
@@ -219,7 +219,7 @@ def test_a_fork_of_a_writer_or_reader_may_not_use_it(tmp_path: Path) -> None:
         "    except TransportError: refused += 1\n"
         "w.close(); r.close(); os._exit(refused)"
     )
-    assert subprocess.run([sys.executable, "-c", program, str(tmp_path)], timeout=20, check=False).returncode == 3
+    assert subprocess.run([sys.executable, "-c", program, str(tmp_path)], timeout=WAIT_S, check=False).returncode == 3
 
 
 @needs_shared_memory
@@ -229,7 +229,7 @@ def test_both_can_be_opened_again(tmp_path: Path) -> None:
         with writer, reader:
             assert until(lambda: writer.wanted)
             assert writer.write(b"x" * 50_000, FrameInfo())
-            frame = reader.read(5)
+            frame = reader.read(WAIT_S)
             assert frame is not None
             assert (frame.info.sequence, frame.shared, reader.counters["writers"]) == (1, True, number)
         assert not writer.wanted
@@ -288,7 +288,7 @@ def test_what_is_not_a_frame_is_refused(tmp_path: Path) -> None:
             publisher.put(b"x" * 50, attachment=attachment)
         sound = FrameInfo(format="s16le", rate=16000, channels=1, sequence=1, writer=7)
         publisher.put(b"\x01\x02", attachment=encode(sound))
-        frame = reader.read(5)
+        frame = reader.read(WAIT_S)
         assert frame is not None
         assert frame.data.tolist() == [1, 2]
         assert frame.info.rate == 16000
@@ -307,7 +307,7 @@ def test_past_a_limit_of_mapped_memory_frames_come_as_bytes_and_the_reader_repor
             frame = reader.read(1)
             return frame is not None and not frame.shared
 
-        assert until(comes_as_bytes, 20)
+        assert until(comes_as_bytes)
         assert "until this process is restarted" in reader.problem
 
 
@@ -316,7 +316,7 @@ def test_late_frames_of_a_replaced_writer_are_ignored(tmp_path: Path) -> None:
         assert until(lambda: publisher.matching_status.matching)
         for life, number in ((7, 5), (8, 1), (7, 6), (8, 1), (8, 2)):
             publisher.put(bytes([number]), attachment=encode(FrameInfo(sequence=number, writer=life)))
-        frames = [reader.read(5) for _ in range(3)]
+        frames = [reader.read(WAIT_S) for _ in range(3)]
         assert [(frame.info.writer, frame.info.sequence) for frame in frames if frame] == [(7, 5), (8, 1), (8, 2)]
         assert reader.read(0.2) is None
 
@@ -335,7 +335,7 @@ def test_anything_with_bytes_can_be_written(tmp_path: Path) -> None:
         assert until(lambda: writer.readers == 2)
         for data in (picture, whole[:, ::2], flat, bytearray(flat), memoryview(flat), np.frombuffer(flat, "<u2")):
             assert writer.write(data, FrameInfo(format="bgr24", width=200, height=100))
-            frame = reader.read(5)
+            frame = reader.read(WAIT_S)
             assert frame is not None
             assert frame.shared
             assert frame.data.tobytes() == flat
@@ -346,7 +346,7 @@ def test_anything_with_bytes_can_be_written(tmp_path: Path) -> None:
             assert (copied.data.tobytes(), copied.shared) == (flat, False)
         assert (of_bytes.shared, of_bytes.problem) == (False, "")
         assert writer.write(b"x" * 1_000_000, FrameInfo())  # no slot is that large
-        big = reader.read(5)
+        big = reader.read(WAIT_S)
         assert big is not None
         assert (big.data.size, big.shared) == (1_000_000, False)
         assert writer.counters["fallbacks"] == 1

@@ -27,7 +27,7 @@ from pebble.extensions.media.frames import Frame, FrameInfo, FrameReader, FrameW
 from pebble.extensions.media.frames.frame import PICTURE_FORMATS, picture
 from tests.ext.av.media_rig import Filming
 from tests.locking import needs_shared_memory
-from tests.support import ROOT, Child, until
+from tests.support import ROOT, WAIT_S, Child, until
 
 LARGE = 500_000  # bytes: the allocator's margin holds no such frame
 
@@ -201,7 +201,7 @@ def test_a_frame_that_was_held_too_long_is_invalid(tmp_path: Path) -> None:
                     step=0.02,
                 )
             holder.send_signal(signal.SIGCONT)
-            valid, found = holder.communicate("\n", timeout=10)[0].split(maxsplit=1)
+            valid, found = holder.communicate("\n", timeout=WAIT_S)[0].split(maxsplit=1)
             assert (valid, "2" in found) == ("False", True)
         finally:
             holder.kill()
@@ -321,11 +321,11 @@ def test_pictures_of_a_robot_by_its_id_its_base_topic_its_run_directory_and_its_
     run_dir = default_run_folder("pebble/robots/goob", env)
     with Filming(run_dir):
         for robot in ("goob", "pebble/robots/goob", run_dir, config, str(config)):
-            with camera(robot, env=env, timeout=5) as pictures:
+            with camera(robot, env=env, timeout=WAIT_S) as pictures:
                 picture = next(pictures)
                 assert (picture.shape, picture[5, 5].tolist()) == ((240, 320, 3), [10, 20, 30])
                 picture[:] = 0  # it is ours
-        with camera("goob", env=env, views=True, timeout=5) as pictures:
+        with camera("goob", env=env, views=True, timeout=WAIT_S) as pictures:
             assert not next(pictures).flags.writeable, "it is the camera's own memory"
             assert pictures.frame is not None
             assert pictures.frame.valid()

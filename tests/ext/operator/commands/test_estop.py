@@ -22,7 +22,7 @@ from tests.ext.page.served import Served
 from tests.fakes.bad_brokers import BEHAVIOURS, resolving, serving
 from tests.kit.played_robot import RecordingRobot
 from tests.sparing_broker import SparingBroker
-from tests.support import Broker, until
+from tests.support import WAIT_S, Broker, until
 from tests.tcp_proxy import TcpProxy
 
 _numbers = itertools.count(1)
@@ -114,7 +114,7 @@ def test_a_robot_that_does_not_answer_is_reported_and_ctrl_c_ends_it(robot_on: M
         assert process.stdout.readline() == f"{robot.id}: stop sent\n"
         assert "not confirmed yet: serial has not confirmed" in process.stdout.readline()
         process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=30)
+        out, err = process.communicate(timeout=WAIT_S)
     assert out.startswith(f"{robot.id}: NOT CONFIRMED, no longer sent: serial has not confirmed")
     assert (process.returncode, err) == (1, "")
     assert robot.count("estop") == robot.count("drive-values") >= 2
@@ -126,9 +126,9 @@ def test_a_stop_is_repeated_until_it_is_confirmed_although_nothing_can_be_printe
     robot = robot_on("serial")
     robot.deaf = True
     with running("estop", robot.id, url, stdout=unread) as process:
-        assert until(lambda: robot.count("estop") >= 4, 30)
+        assert until(lambda: robot.count("estop") >= 4)
         robot.deaf = False
-        _, err = process.communicate(timeout=30)
+        _, err = process.communicate(timeout=WAIT_S)
     assert (process.returncode, err) == (0, "")
     assert robot.latched
 
@@ -140,7 +140,7 @@ def test_a_slow_network_does_not_delay_repetitions(robot_on: Make, broker: Broke
         TcpProxy(broker.port, delay_s=0.2) as proxy,
         running("estop", robot.id, f"--url=mqtt://127.0.0.1:{proxy.port}"),
     ):
-        assert until(lambda: robot.count("estop") >= 2, 30)
+        assert until(lambda: robot.count("estop") >= 2)
     first, second, *_ = robot.times("estop")
     assert second - first < 1.7, "two seconds if it waited for its subscriptions"
 
@@ -165,18 +165,18 @@ def at_rest(robot: RecordingRobot) -> bool:
 def test_a_hold_stops_robots_that_come_online_later(robot_on: Make, url: str) -> None:
     early = robot_on("serial")
     with running("estop", "--all", "--hold", url) as process:
-        assert until(lambda: early.latched, 30)
+        assert until(lambda: early.latched)
         late = robot_on("serial")
-        assert until(lambda: late.latched, 5)
+        assert until(lambda: late.latched)
         latch = late.motors.owners[0].latch
         assert latch.reset(latch.boot, latch.count, 0, 0)
         late.publish_states()
         last = robot_on("serial")
-        assert until(lambda: last.latched, 5)
+        assert until(lambda: last.latched)
         assert not late.latched, "reset on purpose"
         assert until(lambda: at_rest(last)), "its confirmation has arrived"
         process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=30)
+        out, err = process.communicate(timeout=WAIT_S)
     names = {robot.motors.owners[0].latch.recent[0] for robot in (early, late, last)}
     assert (process.returncode, err, len(names)) == (0, "", 1)
     assert f"stop {names.pop()} is held" in out
@@ -189,7 +189,7 @@ def test_a_lost_broker_is_waited_for(tmp_path: Path) -> None:
     robot.publish_states()
     robot.deaf = True
     with running("estop", robot.id, f"--url=mqtt://127.0.0.1:{broker.port}") as process:
-        assert until(lambda: robot.count("estop") >= 1, 30)
+        assert until(lambda: robot.count("estop") >= 1)
         broker.kill()
         assert process.stderr is not None
         assert process.stderr.readline().startswith(
@@ -241,7 +241,7 @@ def test_a_stop_waits_for_nothing_that_a_broker_keeps(
             page.send("estop", ref=more[0], stop="a" * 16)
         else:
             opened.enter_context(running(program_, *more, f"--url=mqtt://127.0.0.1:{sparing.port}"))
-        assert until(lambda: robot.count("estop") > 3, 10), "it is repeated"
+        assert until(lambda: robot.count("estop") > 3), "it is repeated"
         assert sparing.stalled or metric == "online"
 
 
@@ -332,7 +332,7 @@ def test_a_declined_reset_resets_nothing(robot_on: Make, url: str) -> None:
     robot.stop()
     with terminal() as (master, slave), running("estop", "reset", robot.id, url, stdin=slave) as process:
         os.write(master, b"n\n")
-        assert process.wait(30) == 1
+        assert process.wait(WAIT_S) == 1
     assert (robot.latched, robot.count("estop-reset")) == (True, 0)
 
 
@@ -344,7 +344,7 @@ def test_a_stop_that_was_not_shown_is_not_reset(robot_on: Make, url: str) -> Non
         assert "stopped by ann@desk" in process.stdout.readline()
         robot.stop("fedcba9876543210", by="bob@door")
         os.write(master, b"y\n")
-        _, err = process.communicate(timeout=30)
+        _, err = process.communicate(timeout=WAIT_S)
     why = "serial: stopped again meanwhile by bob@door"
     assert err == f"pebble: {robot.id} is still stopped: {why}; look again, then repeat\n"
     assert (process.returncode, robot.latched, robot.count("estop-reset")) == (1, True, 1)
@@ -400,8 +400,8 @@ def test_a_stopped_robot_is_not_driven_unless_forced(run: Run, robot_on: Make, u
 def test_driving_ends_when_the_robot_is_stopped(robot_on: Make, url: str) -> None:
     robot = robot_on("serial")
     with running("topic", "pub", "drive-values", '{"z": 0.3}', "--rate=50", url, f"--robot={robot.id}") as process:
-        assert until(lambda: robot.count("drive-values") >= 3, 30)
+        assert until(lambda: robot.count("drive-values") >= 3)
         robot.stop()
-        _, err = process.communicate(timeout=30)
+        _, err = process.communicate(timeout=WAIT_S)
     assert process.returncode == 1
     assert f"{robot.id} is stopped by ann@desk" in err

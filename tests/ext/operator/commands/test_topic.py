@@ -20,7 +20,7 @@ from pebble.extensions.operator.commands.draft import draft
 from pebble.extensions.operator.contract.schemas import schemas
 from tests.commands.command_line import GOOB, Run, running
 from tests.kit.played_robot import RecordingRobot
-from tests.support import Broker, until
+from tests.support import WAIT_S, Broker, until
 from tests.transports.zenoh_net import HubProcess
 
 _numbers = itertools.count(1)
@@ -54,7 +54,7 @@ def test_what_is_published_is_echoed_and_its_rate_measured_on_either_transport(
         assert run("topic", "hz", "charging-level", "--seconds", "0.5", *at) == 1, "what is retained does not count"
         assert set(run.out.splitlines()) == {"no new messages"}
         pub.send_signal(signal.SIGINT)
-        assert (pub.communicate(timeout=30), pub.returncode) == (("", ""), 130)
+        assert (pub.communicate(timeout=WAIT_S), pub.returncode) == (("", ""), 130)
 
 
 def test_retained_topics_are_listed_with_their_synonym_and_echoed_raw(at: tuple[str, str, str], run: Run) -> None:

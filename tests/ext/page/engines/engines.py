@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 from websockets.sync.client import ClientConnection, connect
 
-from tests.support import Child, free_port, listening, until
+from tests.support import WAIT_S, Child, free_port, listening, until
 
 #: Keys that a character cannot name, as WebDriver has them (W3C WebDriver, 17.4.2).
 KEYS = {"Escape": "\ue00c", "Enter": "\ue007", "Control": "\ue009", "Meta": "\ue03d", "Space": " "}
@@ -196,13 +196,13 @@ def webkit(folder: Path) -> Iterator[WebKit]:
     with ExitStack() as stack:
         screen = ["Xvfb", "-displayfd", "1", "-nolisten", "tcp", "-screen", "0", "1400x1000x24"]
         number = stack.enter_context(running(screen, folder / "display"))
-        assert until(lambda: number.read_text().endswith("\n"), 20), "Xvfb did not start"
+        assert until(lambda: number.read_text().endswith("\n")), "Xvfb did not start"
         homes = {name: str(folder) for name in ("HOME", "XDG_DATA_HOME", "XDG_CACHE_HOME", "XDG_CONFIG_HOME")}
         environment = {**os.environ, **homes, "DISPLAY": f":{number.read_text().strip()}", "LC_ALL": "C"}
         environment |= {"NO_AT_BRIDGE": "1", "LIBGL_ALWAYS_SOFTWARE": "1"}
         driver = ["WebKitWebDriver", "--host=127.0.0.1", f"--port={port}"]
         stack.enter_context(running(driver, folder / "driver", environment))
-        assert until(lambda: listening(port), 20), "WebKitWebDriver did not start"
+        assert until(lambda: listening(port)), "WebKitWebDriver did not start"
         yield stack.enter_context(closing(WebKit(port, str(browsers[-1]))))
 
 
@@ -216,7 +216,7 @@ def running(command: list[str], output: Path, env: Mapping[str, str] | None = No
     finally:
         process.terminate()
         try:
-            process.wait(10)
+            process.wait(WAIT_S)
         finally:
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)

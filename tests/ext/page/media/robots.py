@@ -29,6 +29,7 @@ from pebble.extensions.page.media.sound import SoundHub
 from pebble.extensions.page.robots import Robots
 from pebble.transports import Message, MqttSettings, QoS, Transport
 from pebble.transports.memory import MemoryHub, MemoryTransport
+from tests.support import WAIT_S
 
 REF = "pebble/robots/goob"
 CAPABILITIES = f"{REF}/outgoing/capabilities"
@@ -338,7 +339,7 @@ async def serving(robot: MediaRobot) -> AsyncIterator[Server]:
         await asyncio.to_thread(robot.close)
 
 
-async def until(condition: Callable[[], object], timeout: float = 10.0) -> None:
+async def until(condition: Callable[[], object], timeout: float = WAIT_S) -> None:
     """Wait until ``condition()`` is true."""
     end = time.monotonic() + timeout
     while not condition():

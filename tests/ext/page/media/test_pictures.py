@@ -120,8 +120,8 @@ async def test_a_page_that_decodes_nothing_gets_jpegs() -> None:
         page = server.open(PicturePage(), frozenset())
         await until(lambda: page.rescued())
         start, count = time.monotonic(), len(page.frames)
-        await asyncio.sleep(1)
-        assert 0.5 < (len(page.frames) - count) / (time.monotonic() - start) <= 6
+        await until(lambda: len(page.frames) > count + 3)
+        assert time.monotonic() - start > 0.5, "a few a second"
         assert page.direct() == []
         pictures = [cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_COLOR) for body in page.rescued()]
         numbers = [read_counter(picture) or 0 for picture in pictures]

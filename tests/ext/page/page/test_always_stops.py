@@ -15,7 +15,7 @@ from tests.ext.page.canned import CannedServer, Show
 from tests.ext.page.served import Served
 from tests.ext.page.states import STATES
 from tests.kit.played_robot import RecordingRobot
-from tests.support import some
+from tests.support import WAIT_S, some
 
 Lose = Callable[[Route], object]
 
@@ -75,11 +75,11 @@ def test_a_page_that_loses_a_file_stops_robots(
         kind = "text/css" if name.endswith(".css") else "text/javascript"
         lost = {re.compile(f"/static/.*/{re.escape(name)}"): FAULTS[fault](server.static.files[name], kind)}
         with tab(browser, server.url + STATES[state].path, script=_SOON, here="commit", routes=lost) as opened:
-            assert opened.until(_SHOWS, 20), (name, fault)
-            assert fault != "lost once" or opened.until(_WHOLE, 20), name
+            assert opened.until(_SHOWS), (name, fault)
+            assert fault != "lost once" or opened.until(_WHOLE), name
             opened.page.wait_for_timeout(500)
             opened.page.evaluate(_PRESS)
-            assert opened.until(lambda: stopped(server), 5), (name, fault)
+            assert opened.until(lambda: stopped(server)), (name, fault)
             while _UNANSWERED:
                 _UNANSWERED.pop().abort()
             opened.context.unroute_all(behavior="ignoreErrors")
@@ -193,7 +193,7 @@ def test_keys_stop_and_one_escape_does_not(show: Show, server: CannedServer, whe
         WHERE[where](opened)
         for key in keys * TIMES.get((where, keys[0]), 1):
             opened.page.keyboard.press(key)
-        assert opened.until(lambda: stopped(server), 2 if KEYS[keys] else 0.8) is KEYS[keys]
+        assert opened.until(lambda: stopped(server), WAIT_S if KEYS[keys] else 0.8) is KEYS[keys]
 
 
 @pytest.mark.parametrize(("leave", "stops"), [("document.exitFullscreen()", True), (f"{_BUTTON}.click()", False)])
@@ -207,4 +207,4 @@ def test_full_screen_that_the_page_did_not_end_is_an_escape(
         opened.page.evaluate(leave)
         assert opened.until("document.fullscreenElement === null")
         opened.page.keyboard.press("Escape")
-        assert opened.until(lambda: stopped(server), 0.5) is stops
+        assert opened.until(lambda: stopped(server), WAIT_S if stops else 0.5) is stops

@@ -27,7 +27,7 @@ from tests.ext.page.states import (
     services,
 )
 from tests.kit.npm import package
-from tests.support import ROOT
+from tests.support import ROOT, SOON_S
 
 PICTURES = ROOT / "build" / "page"
 WIDTHS: dict[Size, tuple[int, ...]] = {
@@ -223,7 +223,7 @@ def _measured(page: Page, size: Size) -> list[str]:
     problems: list[str] = []
     for width in WIDTHS[size]:
         page.set_viewport_size({"width": width, "height": before["height"]})
-        deadline = time.monotonic() + 2
+        deadline = time.monotonic() + SOON_S
         page.wait_for_timeout(60)
         while (wrong := _wrong(page)) and time.monotonic() < deadline:
             page.wait_for_timeout(60)

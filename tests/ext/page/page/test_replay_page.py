@@ -12,6 +12,7 @@ from tests.ext.page.browser import Tab
 from tests.ext.page.canned import CannedServer, Show
 from tests.ext.page.recorded import DAY, ROBOT
 from tests.ext.page.states import GAP, START, STATES
+from tests.support import WAIT_S
 
 pytest.importorskip("duckdb")  # it makes timelines
 pytestmark = [pytest.mark.page, pytest.mark.timeout(180)]
@@ -28,14 +29,14 @@ def replay(show: Show, server: CannedServer) -> Iterator[Tab]:
     """Half a minute after the begin, paused; whatever a test does there, no robot is sent anything."""
     with show(STATES["replay"]) as opened:
         assert shown(opened, AT)
-        assert opened.until("!!window.pebble?.replay?.day.timeline", 30)
+        assert opened.until("!!window.pebble?.replay?.day.timeline")
         yield opened
         assert {message["op"] for message in server.received} <= USUAL
         assert [message["ref"] for message in server.sent("watch")] == [""] * len(server.sent("watch"))
         assert opened.complaints() == []
 
 
-def shown(opened: Tab, at: int, within: float = 15.0) -> bool:
+def shown(opened: Tab, at: int, within: float = WAIT_S) -> bool:
     """Whether the picture that was received at this time is drawn, after the newest seek."""
     return opened.until(lambda: opened.page.evaluate(_DRAWN, at), within)
 
@@ -51,7 +52,7 @@ def seek(opened: Tab, at: float) -> None:
 def test_the_way_to_a_day_and_a_robot(show: Show) -> None:
     with show(replace(STATES["recordings"], path="/")) as opened:
         opened.page.get_by_role("link", name="Recordings", exact=True).click()
-        assert opened.until("window.pebble?.replay?.video.info", 30)  # a picture is there at once
+        assert opened.until("window.pebble?.replay?.video.info")  # a picture is there at once
         assert GAP[1] <= position(opened) <= GAP[1] + 20_000  # the first one of the newest session
         opened.test("open-days").click()
         opened.page.get_by_role("link", name="All days").click()
@@ -60,7 +61,7 @@ def test_the_way_to_a_day_and_a_robot(show: Show) -> None:
         assert "10:00 to 10:06" in day.inner_text()
         assert "1 gap" in day.inner_text()
         day.get_by_role("link", name="goob").click()
-        assert opened.until("window.pebble?.replay?.feed.seeks > 0", 30)
+        assert opened.until("window.pebble?.replay?.feed.seeks > 0")
         assert START <= position(opened) <= START + 10_000  # the first picture of its first session
         opened.test("badge").get_by_role("link").click()
         assert opened.until(lambda: opened.page.url.endswith(f"/r/{ROBOT}"))
@@ -104,10 +105,10 @@ def test_the_sound_of_then_is_heard_also_after_a_seek(replay: Tab) -> None:
     heard = "pebble.replay.sound.link.stats?.received > 10"
     for name in ("listen", "play"):
         replay.test(name).click()
-    assert replay.until(heard, 20)
+    assert replay.until(heard)
     seek(replay, AT + 3000)
     assert replay.until(f"!({heard})")
-    assert replay.until(heard, 20)
+    assert replay.until(heard)
 
 
 def test_a_film_is_taken_home(replay: Tab) -> None:

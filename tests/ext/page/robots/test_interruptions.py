@@ -111,7 +111,7 @@ def test_the_wheels_stop_and_wait_for_a_new_press(at_lamp: Console, what: str) -
     one.cause(at_lamp)
     assert until(lambda: at_lamp.wheels == (0, 0), one.deadline_s)
     rested = time.monotonic_ns()
-    assert until(lambda: time.monotonic_ns() - began > 1e9 * one.lasts_s, 5)
+    assert until(lambda: time.monotonic_ns() - began > 1e9 * one.lasts_s)
     one.cure(at_lamp)
     at_lamp.held.clear()  # Chromium repeats no key by itself, so it stays down
     assert at_lamp.because("", "free", "release")
@@ -160,7 +160,7 @@ def test_a_connection_that_fails_stops(
         robot.take()
         assert robot.press_anew()
         robot.test("release").click()
-        assert robot.because("free", within=3)
+        assert robot.because("free")
 
 
 @pytest.mark.parametrize("seconds", [0.4, 3.0])

@@ -62,7 +62,7 @@ def test_the_stick_follows_a_finger_until_it_is_lifted(
             assert robot.rests()
         assert robot.drive_by_stick()
         robot.fingers.move(1, robot.place("stick")[0], 1)  # far above the stick
-        assert robot.tab.until(lambda: robot.wheels == FORWARD, 2)
+        assert robot.tab.until(lambda: robot.wheels == FORWARD)
         robot.fingers.up(1)
         assert robot.rests()
 
@@ -73,12 +73,12 @@ def test_the_stick_follows_a_finger_until_it_is_lifted(
 def test_a_second_finger_on_stop_latches(at_lamp: Phone, wire: Wire) -> None:
     assert at_lamp.drive_by_stick()
     at_lamp.touch("stop-one")
-    assert at_lamp.tab.until(lambda: wire.latched("minilamp"), 2)
+    assert at_lamp.tab.until(lambda: wire.latched("minilamp"))
     assert at_lamp.rests()
     at_lamp.fingers.up(2)
-    assert at_lamp.because("stopped", within=3)
+    assert at_lamp.because("stopped")
     at_lamp.reset()
-    assert at_lamp.tab.until(lambda: not wire.latched("minilamp"), 3)
+    assert at_lamp.tab.until(lambda: not wire.latched("minilamp"))
     left, top, size = at_lamp.place("stick")
     at_lamp.fingers.move(1, left, top - 0.3 * size)
     assert at_lamp.stays_at_rest()

@@ -19,7 +19,7 @@ from pebble.extensions.recordings.files.recorded import Recorded
 from pebble.extensions.recordings.recorder.intake import EVENTS
 from pebble.transports import Message, MqttSettings, QoS, Transport, create
 from tests.commands.command_line import Run, program
-from tests.support import AmqttBroker, Broker, until
+from tests.support import WAIT_S, AmqttBroker, Broker, until
 
 GOOB = "pebble/robots/goob"
 ONLINE, AUDIO, STATUS = f"{GOOB}/outgoing/online", f"{GOOB}/outgoing/audio", f"{GOOB}/outgoing/status"
@@ -35,7 +35,7 @@ def recording(root: Path, port: int, *options: str) -> Iterator[subprocess.Popen
             yield process
         finally:
             process.send_signal(signal.SIGINT)
-            process.wait(20)
+            process.wait(WAIT_S)
 
 
 def client(port: int, name: str = "robot") -> Transport:
@@ -80,7 +80,7 @@ def publish_all(robot: Transport, reference: Reference, number: int = 300) -> No
         robot.publish(AUDIO, b"PBAT\x01\x01\x01\x00" + bytes(12) + count.to_bytes(4, "big"), qos=QoS.LATEST)
         robot.publish(DRIVE, b'{"x":0.1,"z":%d}' % count, qos=QoS.DELIVERED)
         time.sleep(0.002)
-    assert until(lambda: len(reference.of(DRIVE)) == number, 10)
+    assert until(lambda: len(reference.of(DRIVE)) == number)
 
 
 def test_what_a_subscriber_sees_is_recorded_byte_for_byte_with_its_flags(tmp_path: Path) -> None:
@@ -141,7 +141,7 @@ def test_an_outage_is_a_gap(tmp_path: Path) -> None:
         time.sleep(3.0)
         os.kill(broker.pid, signal.SIGCONT)
         ended = time.time()
-        assert until(lambda: events(recorded(root), "gap"), 10, step=0.2)
+        assert until(lambda: events(recorded(root), "gap"), step=0.2)
     (gap,) = events(recorded(root), "gap")
     assert gap["why"] == "no connection"
     assert gap["since"] / 1e3 == pytest.approx(began, abs=3.0)  # a silence is noticed after two seconds
@@ -153,7 +153,7 @@ def test_there_is_no_broker_yet(tmp_path: Path) -> None:
     with program("record", "--url", "mqtt://127.0.0.1:1", "--into", tmp_path / "rec", "--for", "1s") as process:
         assert process.stderr is not None
         assert "cannot connect to mqtt://127.0.0.1:1 yet" in process.stderr.readline()
-        assert process.wait(20) == 0
+        assert process.wait(WAIT_S) == 0
 
 
 @pytest.mark.parametrize(

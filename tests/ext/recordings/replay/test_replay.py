@@ -18,7 +18,7 @@ from tests.commands.command_line import Run, program
 from tests.ext.recordings import messages
 from tests.ext.recordings.playing import FRED, GOOB, Line, demo, js, ms, write
 from tests.ext.recordings.recorder.test_record import Reference
-from tests.support import Broker, until
+from tests.support import WAIT_S, Broker, until
 
 REPLAYED = "replay/robots/goob"
 ONLINE, STATUS, LOGS = (f"{REPLAYED}/outgoing/{metric}" for metric in ("online", "status", "logs"))
@@ -73,7 +73,7 @@ def meanwhile(job: Callable[[], object]) -> Iterator[None]:
     thread = threading.Thread(target=job)
     thread.start()
     yield
-    thread.join(20)
+    thread.join(WAIT_S)
 
 
 def test_replayed_at_ten_times_its_speed_it_is_the_same(
@@ -121,8 +121,8 @@ def test_ctrl_c_leaves_nothing_that_moves(tmp_path: Path, operator: Reference, a
     process = program("replay", walk(tmp_path), *at, "--incoming")
     assert until(lambda: len(operator.of(LOGS)) > 2)
     process.send_signal(signal.SIGINT)
-    assert (process.communicate(timeout=20)[1], process.returncode) == ("", 0)
-    assert until(lambda: states(operator)[-1] is False, 3)
+    assert (process.communicate(timeout=WAIT_S)[1], process.returncode) == ("", 0)
+    assert until(lambda: states(operator)[-1] is False)
     assert json.loads(operator.of(f"{REPLAYED}/incoming/drive-values")[-1])["valid_ms"] == 0
 
 
@@ -134,7 +134,7 @@ def test_when_it_is_killed_the_broker_publishes_that_its_robots_are_offline(
     assert until(lambda: all(len(operator.of(topic)) > 2 for topic in heartbeats))
     process.kill()
     process.communicate()
-    assert until(lambda: all(states(operator, topic)[-1] is False for topic in heartbeats), 5)
+    assert until(lambda: all(states(operator, topic)[-1] is False for topic in heartbeats))
 
 
 def test_a_broker_that_restarts_gets_the_rest(tmp_path: Path, run: Run) -> None:
@@ -146,7 +146,7 @@ def test_a_broker_that_restarts_gets_the_rest(tmp_path: Path, run: Run) -> None:
         broker.kill()
         time.sleep(0.2)
         broker.start()  # it ends with this thread
-        assert until(lambda: states(operator)[-1] is False, 20)
+        assert until(lambda: states(operator)[-1] is False)
 
     with meanwhile(restart):
         assert run("replay", walk(tmp_path, 3), "--url", f"mqtt://127.0.0.1:{broker.port}") == 0

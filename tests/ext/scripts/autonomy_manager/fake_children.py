@@ -94,7 +94,7 @@ class Bench:
 
     def becomes(self, **fields: Any) -> bool:
         """Wait until the status has these fields."""
-        return until(lambda: fields.items() <= self.status.items(), 3)
+        return until(lambda: fields.items() <= self.status.items())
 
     def command(self, body: Any, *, retain: bool = False) -> None:
         self.world.command("autonomy-command", body, retain=retain)
@@ -103,7 +103,7 @@ class Bench:
         """Start a script, and wait for its process."""
         before = len(self.children.all)
         self.command({"action": "start", "file": file, "config": config})
-        assert until(lambda: file in [child.launch.file for child in self.children.all[before:]], 3), self.status
+        assert until(lambda: file in [child.launch.file for child in self.children.all[before:]]), self.status
         assert self.becomes(running=True, file=file)
         return next(child for child in self.children.all[before:] if child.launch.file == file)
 
@@ -135,9 +135,9 @@ class Bench:
         """Wait until the service has done what it has received so far."""
         done: list[bool] = []
         self.service.post(lambda: done.append(True))
-        assert until(lambda: done, 3)
+        assert until(lambda: done)
         self.service.post(lambda: done.append(True))  # after the timers of the first
-        assert until(lambda: len(done) == 2, 3)
+        assert until(lambda: len(done) == 2)
 
     def zeros(self, run: int) -> int:
         """How often the manager has stopped the wheels for a run since this began."""

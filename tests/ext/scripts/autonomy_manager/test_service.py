@@ -16,7 +16,7 @@ from pebble.services.autonomy_manager.catalogue import Catalogue
 from pebble.services.autonomy_manager.motor_owners import OVERRIDDEN
 from pebble.services.autonomy_manager.script import Dependency, Script
 from tests.ext.scripts.autonomy_manager.fake_children import Bench, FakeChild
-from tests.support import until
+from tests.support import WAIT_S, until
 
 SPEED = Setting(key="speed", type="float", default=0.5, arg="--speed", max=1)
 TERM, KILL = signal.SIGTERM, signal.SIGKILL
@@ -373,7 +373,7 @@ def test_a_start_waits_until_its_script_is_listed_unless_something_comes_first(
 
     def scan(catalogue: Catalogue, found: Callable[[dict[str, Script]], None]) -> None:
         scans.append(catalogue)
-        assert lists.wait(5)
+        assert lists.wait(WAIT_S)
         found(SCRIPTS)
 
     monkeypatch.setattr(Catalogue, "scan", scan)

@@ -18,7 +18,7 @@ from pebble.contract.payloads import Drive
 from pebble.runtime.connections import local_transport
 from pebble.transports import Message, QoS
 from tests.ext.operator.client.estop_robot import estop_state
-from tests.support import Broker, Child, until
+from tests.support import WAIT_S, Broker, Child, until
 from tests.transports.zenoh_net import HubProcess
 
 
@@ -50,7 +50,7 @@ class Station:
         self.received: list[Received] = []
         self._scripts: list[subprocess.Popen[str]] = []
         self.transport = local_transport(self.config, "owner")
-        self.transport.open(10)
+        self.transport.open(WAIT_S)
         self.transport.subscribe(DRIVE.topic(self.config.base), self._receive)
         self.publish_state()
 
@@ -74,7 +74,7 @@ class Station:
         """Start it, and wait until it drives."""
         before = len(self.received)
         script = self.start(body, **options)
-        assert until(lambda: self.moves(before), 20), script.communicate(timeout=5)[0]
+        assert until(lambda: self.moves(before)), script.communicate(timeout=WAIT_S)[0]
         return script
 
     def moves(self, since: int = 0) -> bool:
@@ -98,7 +98,7 @@ class Station:
         for script in self._scripts:
             if script.poll() is None:
                 script.send_signal(signal.SIGKILL)
-            script.communicate(timeout=10)
+            script.communicate(timeout=WAIT_S)
         self.transport.close()
         if self.broker is not None:
             self.broker.stop()

@@ -15,7 +15,7 @@ from pebble.extensions.media.frames import FrameInfo, FrameWriter
 from pebble.transports import Message, QoS
 from tests.ext.scripts.perception.test_tags import SIZE, picture
 from tests.ext.scripts.script.station import Station
-from tests.support import ROOT
+from tests.support import ROOT, WAIT_S
 
 FPS = 15
 
@@ -60,7 +60,7 @@ class Sensors:
 
     def close(self) -> None:
         self._ended.set()
-        self._thread.join(10)
+        self._thread.join(WAIT_S)
         self._writer.close()
 
     def _touch(self, mm: float) -> None:

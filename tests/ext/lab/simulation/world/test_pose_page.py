@@ -13,7 +13,7 @@ import pytest
 from pebble.errors import DeviceError
 from pebble.extensions.lab.simulation.world.pose_page import PosePage, PoseReader
 from pebble.extensions.lab.simulation.world.poses import RobotPose, Sample, Track
-from tests.support import Child, until
+from tests.support import WAIT_S, Child, until
 
 BUSY = """
 import sys
@@ -53,7 +53,7 @@ def test_no_sample_is_torn_under_a_busy_writer_and_a_killed_one_is_replaced(busy
         assert tracks["goob"].newest.ns >= newest
         newest = tracks["goob"].newest.ns
     busy_writer.kill()
-    busy_writer.wait(10)
+    busy_writer.wait(WAIT_S)
     page = PosePage(path, ["goob"])
     assert reader.tracks() == {}, "its world was started again"
     assert PoseReader(path).tracks() == {}, "nothing of the killed program is left"

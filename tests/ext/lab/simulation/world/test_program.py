@@ -22,7 +22,7 @@ from pebble.extensions.lab.simulation.trace import read_trace
 from pebble.extensions.lab.simulation.world.pose_page import PoseReader, page_path
 from pebble.extensions.lab.simulation.world.poses import RobotPose, Track
 from pebble.extensions.lab.simulation.world.program import imu_port_path, port_path, trace_path
-from tests.support import Child, until
+from tests.support import WAIT_S, Child, until
 
 ROOM = Path(pebble.extensions.lab.simulation.world.__file__).with_name("room.json")
 
@@ -43,11 +43,11 @@ def running(room: Path, *options: str) -> Iterator[Child]:
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with Child(command(room, *options), text=True, **pipes) as child:
         try:
-            assert until(lambda: any(track.newest.ns > began for track in tracks(room).values()), 30)
+            assert until(lambda: any(track.newest.ns > began for track in tracks(room).values()))
             yield child
         finally:
             child.terminate()
-            child.communicate(timeout=30)
+            child.communicate(timeout=WAIT_S)
 
 
 def tracks(room: Path) -> dict[str, Track]:
