@@ -2,8 +2,8 @@
 
 A broker's own bridge, or a second robot with this id, may forward the same topics. If a probe that we publish on one
 side comes back on the other, its topic circulates. It is sent on that very topic, because what brings messages back may
-carry no other. Its payload is white space that encodes a random number, which no parser of commands accepts. On topics
-other than commands it follows the topic's value, which white space does not change.
+carry no other. Its payload is white space that encodes a random number; no parser of commands accepts that. On topics
+other than commands the payload is the topic's value with this white space behind it, which does not change the value.
 """
 
 import logging

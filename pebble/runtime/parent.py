@@ -124,7 +124,7 @@ class Notifier:
         return self._write(notes.Held(program, on))
 
     def feature(self, name: str, has: bool) -> bool:
-        """Report whether this process has a feature of pebble.launcher.features; the capabilities follow."""
+        """Report whether this process has a feature of pebble.launcher.features, which the capabilities then show."""
         return self._write(notes.Feature(name, has))
 
     def local(self, connected: bool, why: str = "") -> bool:

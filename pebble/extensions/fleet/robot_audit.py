@@ -89,7 +89,7 @@ class Audit(Observer):
         self._writer.close()
 
     def note(self, what: str, who: str = ROBOT, *, most: int = DIFFERENT, **more: str | float | bool) -> None:
-        """Add a row; ``what`` is one of a fixed set. ``most``: as of the writer."""
+        """Add a row; ``what`` is one of a fixed set. ``most``: see :meth:`RowWriter.add`."""
         self._writer.add({"t": round(time.time(), 3), "what": what, "who": who, **more}, most=most)
 
     def passed(self, channel: Channel, by: str | None, payload: bytes) -> None:
