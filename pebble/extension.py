@@ -126,7 +126,7 @@ class Facts(Struct, frozen=True):
 class Extension(Struct, frozen=True, kw_only=True, eq=False):
     """Declaration of what an extension adds. Parts are written ``module:name``; an empty one adds nothing.
 
-    A robot whose config lists one with ``motors`` does not start without it.
+    A robot whose config lists an extension with ``motors`` does not start without that extension.
     """
 
     name: str

@@ -54,7 +54,7 @@ class _Clock:
 
     @property
     def standing(self) -> tuple[float, float]:
-        """Sort key for forgetting clocks: first those with messages over the shortest time, then the longest silent."""
+        """Sort key for forgetting: the shortest time from first to newest message; if equal, the longest silence."""
         return self.received_at - self.began, self.received_at
 
 
@@ -77,7 +77,7 @@ class SenderClocks(Generic[K]):
         """Return the seconds that a message stamped ``sent`` has waited at ``now``; learn the sender's clock from it.
 
         A message that has waited for more than ``late_s`` is late. ``waited_s``: the most that it can have waited, by
-        other evidence; if that is in time, it proves a difference. A clock younger than two seconds returns no less.
+        other evidence; if not late, it proves a least difference. A clock under 2 s old returns at least ``waited_s``.
         """
         with self._lock:
             clock = self._clocks.get(key)

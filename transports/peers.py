@@ -89,7 +89,7 @@ class FileLock:
 
     @classmethod
     def wait(cls, path: Path) -> FileLock:
-        """Lock a file with a new name. Waits while another process checks, for a moment, whether its owner runs."""
+        """Lock a new file. Wait if a process holds its lock for a moment, to see whether the file's owner runs."""
         return cls._get(path, fcntl.LOCK_EX)
 
     @classmethod

@@ -14,8 +14,8 @@ _WATCHDOG_MS = const(60_000)  # longer than any: larger numbers are cut, because
 def load(raw: memoryview | bytes):
     """Return parsed JSON of limited size and depth. Raises ValueError, OverflowError or MemoryError.
 
-    Around it may be what programs add: a byte order mark, white space, a C string's NUL and the rest of its buffer. It
-    is cut off up to printable ASCII, as JSON's ends are. Bytes from 0xF5 on stay: as no UTF-8 they must be refused.
+    Programs may add a byte order mark, white space, or a C string's NUL and the rest of its buffer. These are removed:
+    JSON begins and ends with printable ASCII. Bytes from 0xF5 on are kept, to be refused: UTF-8 never has them.
     """
     size = len(raw)
     if size > _MAX_BYTES:

@@ -15,8 +15,8 @@ def query(host: str, nonce: bytes) -> bytes:
 def answer(data: bytes, asked: bytes, skip: int = 0) -> str | None:
     """Return the address in ``data``, "" if there is none, None if it does not answer the query ``asked``.
 
-    Of several addresses it is the first one if ``skip`` is 0. Otherwise ``skip`` counts them in numeric order, from the
-    smallest again after the last: servers change the order of their answers, so only a fixed order tries each.
+    Of several addresses it returns the first if ``skip`` is 0. Else it sorts them, and ``skip`` modulo their number is
+    the index. Servers change the order of their answers: so a caller can try each only by its place in a sorted list.
     """
     at = len(asked)
     if len(data) < at or data[:2] != asked[:2] or data[12:at].lower() != asked[12:]:

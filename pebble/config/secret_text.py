@@ -36,7 +36,7 @@ def without_secrets(text: str) -> str:
 
 
 def _without_login(match: re.Match[str]) -> str:
-    """Return a word with stars from ``://`` to its last @ or, without ``://``, for the ``NAME:PASSWORD`` before it."""
+    """Return a word with stars before its last @: from ``://`` on or, without that, in place of ``NAME:PASSWORD``."""
     word = match[0]
     ats = [at.start() for at in _AT.finditer(word)]
     if not ats:

@@ -305,7 +305,7 @@ def tree_of(sections: Mapping[str, type[Section]]) -> type[Root]:
 
 
 def _with(kind: type[Section], sections: Mapping[str, type[Section]]) -> Any:
-    """Return a subclass of ``kind`` with more sections; a dotted key belongs to one of its sections."""
+    """Return a subclass of ``kind`` with more sections; ``services.lamp`` adds ``lamp`` to its section ``services``."""
     added: list[tuple[str, Any]] = []  # keys with their annotations
     for key, section in sections.items():
         if "." not in key:

@@ -347,7 +347,7 @@ class Wire(Payload, frozen=True, kw_only=True, omit_defaults=True):
     """The form of a robot's groups of streams; what takes them apart needs nothing else."""
 
     v: Literal[1] = 1
-    group_hz: float
+    group_hz: float  # an expander, which splits the groups, needs only these fields
     named: bool = False  # it takes commands only with an account's name in the topic
     dict_id: Annotated[int, Meta(ge=1, le=31)] | UnsetType = UNSET  # the first byte of groups that need ``dict``
     dict: str | UnsetType = UNSET  # the dictionary of their deflate

@@ -2,8 +2,8 @@
 
 A broker's own bridge, or a second robot with this id, may forward the same topics. If a probe that we publish on one
 side comes back on the other, its topic circulates. It is sent on that very topic, because what brings messages back may
-carry no other. Its payload is white space that encodes a random number, which no parser of commands accepts. On topics
-other than commands it follows the topic's value, which white space does not change.
+carry no other. Its payload is white space that encodes a random number; no parser of commands accepts that. On topics
+other than commands the payload is the topic's value with this white space behind it, which does not change the value.
 """
 
 import logging
@@ -163,7 +163,7 @@ class Cycles:
         return Finding.RELAY
 
     def _close(self, side: Side, topic: str) -> None:
-        """Note that what is forwarded from ``side`` on ``topic`` comes back there."""
+        """Close a way: what is forwarded from ``side`` on ``topic`` comes back there."""
         way = self._way(side, topic)
         way.unanswered = 0
         if way.closed or len(self.closed_ways) >= _MOST_CLOSED:
@@ -182,7 +182,7 @@ class Cycles:
         self.closed_ways.add((side, topic))
 
     def _open(self, side: Side, topic: str) -> None:
-        """Note that what is forwarded from ``side`` on ``topic`` comes back no more."""
+        """Open a way: what is forwarded from ``side`` on ``topic`` comes back no more."""
         self._ways[side, topic].closed = False
         self.closed_ways.discard((side, topic))
         if not self.closed_ways:

@@ -342,7 +342,7 @@ class Forwarder:
         return Message(message.topic, passing, message.qos)
 
     def deliver(self, source: SideState, subject: Subject, message: Message, forward: Forward) -> Forward | Drop:
-        """Publish a message that is not retained; until the gate between the sides opens, keep an event."""
+        """Publish a message that is not retained, if the :class:`Gate` is OPEN. While it is WAITING, hold an event."""
         target = self.sides[source.side.other]
         is_event = subject.kind is Kind.EVENT and message.qos is QoS.DELIVERED
         if self.sides.gate is not Gate.OPEN:

@@ -202,5 +202,5 @@ class Reconciliation:
         return self._synchronized[self._winner] and topic not in self._received[self._winner]
 
     def _is_missing(self, side: Side, topic: str, last: LastValue) -> bool:
-        """True if ``side`` lacks the newest value; a removal only if a value was forwarded to ``side`` before."""
+        """True if ``side`` lacks the newest value. It lacks a removal only if a value was forwarded to it before."""
         return topic not in self._received[side] and self._published[side].get(topic, b"") != last.payload

@@ -19,7 +19,7 @@ _RETAINED_STOPS_S = 10.0
 
 
 class RetainedWindow:
-    """The time after a subscription in which retained messages of ``transport`` still arrive."""
+    """The time in which messages with the retain flag may be old: until shortly after ``transport`` has subscribed."""
 
     def __init__(self, transport: Transport, clock: Callable[[], float]) -> None:
         self._transport, self._clock = transport, clock
@@ -39,7 +39,7 @@ class RetainedWindow:
         self._until = self._stops_until = float("inf")
 
     def subscribed(self) -> None:
-        """Note that the subscription is complete, and its retained messages have arrived."""
+        """Note that the subscription is complete, and its retained messages have arrived: the window ends soon."""
         self._subscribed_at = now = self._clock()
         self._until = now + _RETAINED_S
         self._stops_until = max(self._until, self._newest_at + INITIAL_SYNC_S)

@@ -78,7 +78,7 @@ class SideState:
     def arrived(self) -> None:
         """Note that the retained messages of this side have arrived.
 
-        From now on a value that this side had before was set again by a program, not restored by its broker.
+        An older value that comes from now on counts as set again by a program, not as restored by the side's broker.
         """
         self._went_back = False
 

@@ -71,7 +71,7 @@ class Subject(Struct, frozen=True, eq=False, dict=True):
 
     @cached_property
     def stamped(self) -> bool:
-        """True if messages may tell their age: by the time of a clock, and a key or id that tells whose."""
+        """True if messages may tell their age: by the time of a clock, and a key or id that identifies the clock."""
         return self.channel is not None and self.channel.payload in (Drive, ControlRequest)
 
     @cached_property

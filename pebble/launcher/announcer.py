@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 
 class Announcer:
-    """A publisher of the envelopes on ``pipe``. It repeats states on every new connection, and sends records once."""
+    """A publisher of the messages on ``pipe``. It repeats states on every new connection, and sends records once."""
 
     def __init__(self, pipe: int, transport: Transport) -> None:
         self._pipe, self._transport = pipe, transport
@@ -98,7 +98,7 @@ class Announcer:
 
 
 def run(make_transport: Callable[[Message], Transport], hub: AbstractContextManager[ZenohHub | None] = _NO_HUB) -> int:
-    """Publish the envelopes on stdin through ``make_transport(will)``, beside the hub; return the exit code."""
+    """Publish the messages on stdin through ``make_transport(will)``, beside the hub; return the exit code."""
     try:
         will = next_envelope(_STDIN)
         if will is None:  # the launcher has ended already

@@ -13,7 +13,7 @@ class Features:
     """The newest notes Feature of all programs; ``on_change()`` is called when a property changes.
 
     ``estop``: the emergency stop. ``control``: requests for control are answered. ``outlets/NAME/status`` and
-    ``outlets/NAME/power``: the contract's topics of an outlet are in use.
+    ``outlets/NAME/power``: the contract's topics of a power outlet are in use.
     """
 
     def __init__(self, on_change: Callable[[], None]) -> None:
@@ -22,12 +22,12 @@ class Features:
 
     @property
     def lacking(self) -> frozenset[str]:
-        """Expected features that at least one process lacks."""
+        """Features among ``estop`` and ``control`` that at least one process lacks."""
         return self._reported & _EXPECTED
 
     @property
     def found(self) -> frozenset[str]:
-        """Features beyond the expected ones, that at least one process has."""
+        """Features other than ``estop`` and ``control`` that at least one process has."""
         return self._reported - _EXPECTED
 
     def receive(self, program: str, note: Feature) -> None:

@@ -121,7 +121,7 @@ class MotionInbox:
             return was_empty
 
     def note_state(self, state: State) -> None:
-        """Note that the connection is lost, and messages with it. The next batch says so."""
+        """Note a state of the connection. In any but CONNECTED messages may be lost, and the next batch says so."""
         if state is not State.CONNECTED:
             with self._lock:
                 self._lost = True

@@ -154,7 +154,7 @@ class MotorOwner(Service, ABC):
             self._judge_soon(self._waiting.put_drive(drive, arrived))
 
     def is_copy(self, command: p.Drive | p.LightsSolid) -> bool:
-        """True if ``command`` is a copy from a message `c.GROUP`, and this motor owner takes that message itself."""
+        """True if ``command`` is a copy of a member of a group (`c.GROUP`), and this motor owner takes whole groups."""
         return self._takes_groups and command.group is True
 
     def _receive_group(self, message: Message, _value: Any, _names: dict[str, str]) -> None:
@@ -340,7 +340,7 @@ class MotorOwner(Service, ABC):
         self._arm_guard()
 
     def _publish_state(self, state: p.EstopState) -> None:
-        """Publish the state. While stops do not latch, clear its topic each time: a bridge may miss one message."""
+        """Publish ``state``; while stops do not latch, clear its topic at each call: a bridge may miss a clearing."""
         if self._latches:
             self.publish(c.ESTOP_STATE, state, owner=self.owner)
         else:

@@ -112,7 +112,7 @@ class Notifier:
     def request(self, program: str, request: ProgramRequest) -> bool:
         """Request or release an on-demand program.
 
-        Only programs with ``may_request`` (pebble.launcher.programs) may; their requests expire 5 s after their end.
+        Only a program with ``may_request`` (pebble.launcher.programs) may. Its requests expire 5 s after it has ended.
         """
         if self._fd is None and not self._no_launcher_logged:
             self._no_launcher_logged = True
@@ -124,7 +124,7 @@ class Notifier:
         return self._write(notes.Held(program, on))
 
     def feature(self, name: str, has: bool) -> bool:
-        """Report whether this process has a feature of pebble.launcher.features; the capabilities follow."""
+        """Report whether this process has a feature of pebble.launcher.features, which the capabilities then show."""
         return self._write(notes.Feature(name, has))
 
     def local(self, connected: bool, why: str = "") -> bool:

@@ -77,7 +77,7 @@ def _may_run(config: Config, script: Script) -> bool:
 
 
 def complete_scripts(context: Any) -> list[str]:
-    """Return the names of the given robot's scripts, or else of Pebble's."""
+    """Return the names of a robot's scripts, by the given config; if it cannot be read, of Pebble's own scripts."""
     file = Path(str(context.params.get("robot")))
     folders: tuple[Path, ...] = (Path(pebble.__file__).with_name("extensions") / "scripts" / "shipped",)
     if file.is_file():

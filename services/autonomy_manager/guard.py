@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 
 class Guard:
-    """Small programs, one for each script, that outlive this process until no script is left.
+    """A starter of small programs, one for each script, that outlive this process until no script is left.
 
     They hold ``lock``, for which the next manager of scripts waits: scripts of two managers never run at once.
     """

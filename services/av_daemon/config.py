@@ -81,7 +81,7 @@ class AvDaemon(ServiceSection, frozen=True, kw_only=True):
 
 
 def _check(reader: Reader, devices: AvDaemon, path: problems.Path) -> AvDaemon:
-    """Check the sockets for programs of the original. Without their folder the robot runs; the programs wait."""
+    """Check the sockets for programs of the original. A missing folder is a warning: only those programs need it."""
     sockets = devices.sockets()
     for section, file in sockets.items():
         if not file.parent.is_dir():

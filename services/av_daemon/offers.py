@@ -12,7 +12,7 @@ from pebble.services.av_daemon.config import AvDaemon
 
 
 def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
-    """Return ``value`` with pictures and sound. Operators control both only with the bridge, which starts programs."""
+    """Return ``value`` with pictures and sound; operators control them only if there is a bridge to request them."""
     devices, controls = config.section(AvDaemon), config.services.mqtt_bridge.enabled
     video, audio = devices.enabled and devices.video.enabled, devices.enabled and devices.audio.enabled
     return replace(

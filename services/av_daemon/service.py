@@ -90,7 +90,7 @@ class AvDaemon(Service):
 
     @every(1.0)
     def publish_status(self) -> None:
-        """Publish the status: changed words within a second, changed numbers within a few seconds."""
+        """Publish a changed status: within a few seconds if only its numbers have changed, else within a second."""
         now = self.clock()
         streams = {stream.name: stream.report(now) for stream in self._streams}
         self._publish(self._reports.current(now) | streams)

@@ -128,7 +128,7 @@ class Step:
 
 
 def _step(quality: str, size: str, rate: str) -> Step:
-    """Return a step with JPEG's costs: half the quality is two thirds of the bytes, small pictures are denser."""
+    """Return a step. A JPEG has two thirds of the bytes at half the quality, a third at half the width and height."""
     q, s, r = Fraction(quality), Fraction(size), Fraction(rate)
     return Step(q, s, r, math.pow(q, 0.6) * math.pow(s, 1.6))
 
@@ -153,7 +153,7 @@ SMALL = 6  # of them: small pictures, as many as are configured
 class LevelControl:
     """The choice among STEPS: down at once as far as necessary, up one step at a time.
 
-    After each step up that failed, the next one comes later. From a reduced ``level`` at the begin, they come soon.
+    After each step up that failed, the next one comes later. If it begins at a reduced ``level``, it goes up soon.
     """
 
     def __init__(self, fps: float, now: float, level: int = 0) -> None:
@@ -170,7 +170,7 @@ class LevelControl:
         return STEPS[self.level]
 
     def lost(self, turns: float, now: float) -> None:
-        """Note that frames could not be sent, because earlier ones were late; ``turns``: how many."""
+        """Note that so many ``turns`` (see FrameSelector) passed without a frame, because earlier frames were late."""
         if now - (turns + 1) * self._frame_s > self._changed_at:  # else those before them were of another step
             self._lost.append((now, turns))
 
@@ -214,7 +214,10 @@ class LevelControl:
         return max(busy, 1.0 + lost_share)  # all its time was used, and the lost turns would have needed more
 
     def _go_down(self, load: float, now: float) -> bool:
-        """Reduce as far as necessary. A step up that was just tried is undone; the next one has to wait longer."""
+        """Reduce as far as necessary; return True if the step has changed.
+
+        A step up that was just tried is undone; the next one has to wait longer.
+        """
         lower = range(self.level + 1, len(STEPS))
         affordable = self.step.cost * _AIM / load
         if self._rose_at is not None and now - self._rose_at < _PROBATION_S:

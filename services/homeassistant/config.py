@@ -48,7 +48,7 @@ def programs(config: Config) -> list[Program]:
 
 
 def facts(config: Config) -> Facts:
-    """Return the line of the summary about Home Assistant."""
+    """Return the line about Home Assistant in the summary of ``pebble check``."""
     section = config.section(HomeAssistant)
     buttons = ", ".join(("stop", *section.expose))
     return Facts((("home assistant", f"{section.prefix}, buttons: {buttons}"),) if section.enabled else ())

@@ -98,7 +98,7 @@ class PassedStops:
     def accept(self, payload: bytes) -> list[bytes]:
         """Remember a named stop as forwarded, and let owners confirm it; return the payloads to publish.
 
-        An owner that was reset since the stop was first forwarded gets no copy, unless it has yet to confirm the stop.
+        An owner that was reset after the stop was first forwarded gets a copy only if it has yet to confirm the stop.
         """
         if not is_stop(payload):
             return [payload]

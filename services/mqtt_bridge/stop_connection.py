@@ -134,7 +134,7 @@ class StopConnection:
         return self._transport.state is State.CONNECTED and not self._transport.not_received
 
     def is_copy(self, message: Message) -> bool:
-        """True if a stop without a name on the main connection has passed already. Remembers or forgets the stop."""
+        """True if this stop of the main connection has no name and came over this one before: see `Copies.is_copy`."""
         return not is_named(message.payload) and self._copies.is_copy(Way.MAIN, message, comes_both_ways=self.listens)
 
     def check(self) -> None:

@@ -23,7 +23,7 @@ class MovingSensors:
 
     @property
     def problem(self) -> str:
-        """The problem in words, or empty. Sensors that have never changed count only if all sensors stand still."""
+        """The problem in words, or empty. Sensors that have never changed count only if no sensor changes now."""
         still = [name for name, check in self._checks.items() if check.repeats]
         if len(still) < len(self._checks):
             still = [name for name in still if self._checks[name].changes]

@@ -89,4 +89,6 @@ def test_what_a_robot_publishes_is_recorded_on_it(kind: str, tmp_path: Path) -> 
             ("outgoing/status", "", 1),
         ):
             assert until(lambda: counted(folder)[f"{BASE}/{topic}", source] >= least), (topic, source)  # noqa: B023
+        assert rig.stop() == 0
+        assert "Traceback" not in rig.log.read_text()
     assert not list(folder.rglob("*.active"))

@@ -39,7 +39,7 @@ class BridgeMode:
             self._note_bridge(result)
 
     def _note_bridge(self, result: Result) -> None:
-        """Note the end of a CONNECT in bridge mode. A hang-up counts after a probe, or if it was missing before."""
+        """Note how a CONNECT in bridge mode ended. A hang-up counts after an accepted probe, or if ``_lacking``."""
         probed, self._probed = self._probed, False
         if result is Result.ACCEPTED:
             self._lacking = False

@@ -232,7 +232,7 @@ class Connection:
         """Send TCP's ACKs at once: a broker with Nagle's algorithm delays its next message until then (up to 40 ms).
 
         The kernel falls back to delayed ACKs whenever we send, so this is called after every read, unless MQTT's own
-        acknowledgements follow and carry TCP's. On a thin link the next one waits for those, see `_ONCE`.
+        acknowledgements follow and carry TCP's. On a thin link TCP's next ACK waits for MQTT's, see `_ONCE`.
         """
         sock = self._client.socket
         if _QUICKACK is not None and sock is not None:
@@ -375,7 +375,7 @@ class Connection:
             return self.in_flight.unconfirmed_retained()
 
     def written_before_loss(self) -> dict[str, int] | None:
-        """Return the bytes by topic that may be why the broker closed the connection; None for another reason."""
+        """Return by topic the size of a message that may be why the broker hung up; None if no message can be."""
         with self._lock:
             incoming = self.incoming
             if not (incoming.may_concern_message or (self._client.hung_up and not incoming.reason)):

@@ -170,8 +170,8 @@ class Dialler:
         """True if the broker's process seems to have ended. ``was_ended``: the result of the last call.
 
         1. A connection was lost (``connected``): True, unless the broker was only silent. It may be we who stood still.
-        2. Nothing listens there: the last result. For `_ENDING_S` after 1 or 2, a broker that ends may still hang up.
-        3. Another attempt to connect has failed: the last result if that was in this time, without silence; else False.
+        2. Nothing listens there: the last result.
+        3. An attempt failed otherwise: the last result; False after silence, or if 1 or 2 is more than `_ENDING_S` ago.
         """
         now, was_silent = time.monotonic(), isinstance(lost, Silent)
         if connected:

@@ -207,9 +207,9 @@ class InFlightTable:
         return self._unacked[mid][0] if mid in self._unacked else None
 
     def first_written(self, now: float) -> dict[str, int]:
-        """Return by topic the size of the largest recent message that may have been too large for the broker.
+        """Return by topic the size of the largest recent message for which the broker may have closed the connection.
 
-        Only those count that are larger than all that the broker has accepted on the topic, as answered pings show.
+        The broker has accepted what was sent before an answered ping; on that topic only larger messages count.
         """
         sizes: dict[str, int] = {}
         for written in [*(ping.written for ping in self._pings), self._written]:

@@ -115,7 +115,7 @@ class BrokerDelay:
         self._delivered_answer = self._read_answer
 
     def delivery(self, now: float) -> tuple[float, float]:
-        """Return the age of the newest ping with all messages before its answer delivered, and how late answers are."""
+        """Return the age of the newest ping whose answer came before the last delivery, and how late answers are."""
         sent_at, took = self._delivered_answer
         waits = now - self._pings[0].sent_at if self._pings else 0.0
         return now - sent_at, max(took, waits) - self._shortest
@@ -170,6 +170,6 @@ class ReadAge:
         self.arriving_at = clock.since_boot()
 
     def note_handled(self) -> None:
-        """Note that retained messages were handled, which may have taken longer than an answer to a ping may."""
+        """Note that retained messages were handled: while this was done, the broker does not count as silent."""
         self.note_arriving()
         self.has_retained = False

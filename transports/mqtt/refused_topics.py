@@ -85,7 +85,7 @@ class RefusedTopics:
                 return
 
     def note_loss(self, where: str, written: Mapping[str, int] | None, now: float) -> None:
-        """Note a lost connection. ``written``: bytes by topic before the loss; None if no message was the reason."""
+        """Note a lost connection. ``written``: by topic, sizes of messages that may be why; None if none can be."""
         written, trial, self._trial = written or {}, self._trial, None
         self._quiet_at = now + QUIET_S
         ordinary = [topic for topic in written if not self._is_vital(topic)]

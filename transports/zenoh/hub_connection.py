@@ -51,7 +51,7 @@ class HubConnection:
     def put(self, session: zenoh.Session, message: Message, *, again: bool) -> None:
         """Send a retained message to the hub, before the live one, so that a subscription in between gets one of them.
 
-        ``again``: the message was published before, and running siblings have it.
+        ``again``: the message was published before, and the running siblings (other peers) have it.
         """
         if not again:
             self.retained_count += 1

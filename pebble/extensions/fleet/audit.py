@@ -106,7 +106,7 @@ class Audit:
 def _values(row: Row) -> tuple[float | str | int, ...]:
     """Return the values of a row in their stored form.
 
-    In a flood, one row tells the number of all further rows of a kind: it has no user, and gets OTHERS.
+    In a flood, one row without a user counts all further rows of a kind: OTHERS is stored as its user.
     """
     texts = (row.get(field, OTHERS if field == "user" else "") for field in _FIELDS)
     return (row["t"], row["what"], *texts, row.get("count", 1))

@@ -95,7 +95,7 @@ def passwords_in(text: str) -> dict[str, Hashed]:
 
 
 def rules_in(acl: str) -> Iterator[str]:
-    """Yield each rule behind its account's name, or behind ``everybody`` if it is before the first account."""
+    """Yield rules as ``ACCOUNT: RULE``; the account is ``everybody`` for a rule before the first account."""
     name = "everybody"
     for line in filter(None, map(str.strip, acl.splitlines())):
         word, _, rest = line.partition(" ")

@@ -89,7 +89,7 @@ class Audit(Observer):
         self._writer.close()
 
     def note(self, what: str, who: str = ROBOT, *, most: int = DIFFERENT, **more: str | float | bool) -> None:
-        """Add a row; ``what`` is one of a fixed set. ``most``: as of the writer."""
+        """Add a row; ``what`` is one of a fixed set. ``most``: see :meth:`RowWriter.add`."""
         self._writer.add({"t": round(time.time(), 3), "what": what, "who": who, **more}, most=most)
 
     def passed(self, channel: Channel, by: str | None, payload: bytes) -> None:
@@ -137,10 +137,10 @@ class Audit(Observer):
         self.note("stop-not-confirmed", owner=owner, stop=str(stop.stop))
 
     def _noted_before(self, row: Row, who: str) -> bool:
-        """True if the log tells this already: the stop has a row, or the sender's lights have blinked like this.
+        """True if the log tells this of the sender already: the stop has a row, or the lights have blinked like this.
 
-        If not, remember it. A stop may arrive twice, with an account and without: from two senders. Lights that blink
-        have one row on and one off, until they rest for a minute.
+        If not, remember it. A stop may arrive with its sender's account, and once more without: each has a row. Lights
+        that blink have one row on and one off, until they rest for a minute.
         """
         if row["what"] == "lights":
             key, now = (who, row["on"]), self._clock()

@@ -133,7 +133,7 @@ class JitterBuffer:
     def _is_old(self, number: int, captured_ms: int) -> bool:
         """True if this packet was played or given up.
 
-        False, and everything starts anew, if the sender has restarted: it was captured later than all packets so far,
+        False, and everything starts anew, if the sender has restarted: the packet was captured later than all so far,
         or too many in a row seemed old.
         """
         if self._expected is None or ahead(number, self._expected) >= 0:

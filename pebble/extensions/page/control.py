@@ -383,7 +383,7 @@ class Control:
         await self._send_logs()
 
     def _driver(self, ref: str) -> m.DriverView:
-        """Return the robot's driver as this page shows it, with words for users without a login."""
+        """Return the robot's driver as this page shows it; a user without a login is described in words."""
         view, login = self._server.drivers.robot(ref).shown(self._tab, clock()), self._server.settings.login
         by = person(view.by, login=login)
         device = view.device if by == view.by else ""  # the words say it already

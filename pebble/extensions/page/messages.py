@@ -119,7 +119,7 @@ class EstopResetOp(_FromPage, frozen=True, kw_only=True, tag="estop-reset"):
 
 
 class PictureFromOp(_FromPage, frozen=True, kw_only=True, tag="picture-from"):
-    """Show the picture of ``source`` on the page of ``ref``, for everybody, from now on; "" is its own."""
+    """Show the picture of ``source`` on the page of ``ref``, for everybody, from now on; "" is that of ``ref``."""
 
     ref: Ref
     source: Ref
@@ -419,7 +419,7 @@ class BrokerView(Struct, frozen=True, kw_only=True):
 
 
 class PictureFrom(Struct, frozen=True, kw_only=True):
-    """``web/picture-from``: the component whose picture is shown on the page of this one; "" is its own."""
+    """``web/picture-from``: the component whose picture this component's page shows; "": this component."""
 
     source: str
 

@@ -275,7 +275,7 @@ class Robots:
             self._mark(component.ref, c.ONLINE.metric)
 
     def _add(self, ref: str) -> Component | None:
-        """Add a component; None if the table is full. If it ``is_wanted``, the newest not ``is_kept`` gives way."""
+        """Add a component; None if the table is full. A wanted one replaces the newest that need not be kept."""
         if len(self.components) >= MAX_COMPONENTS:
             if not self.omitted:
                 log.warning("more than %d components at this broker: give it accounts", MAX_COMPONENTS)
@@ -367,7 +367,7 @@ class Robots:
                 interest.notify()
 
     def _mark(self, ref: str, metric: str, *, everybody: bool = False) -> None:
-        """Note that pages need this value: all pages or, for a metric of open components, those that show it."""
+        """Note that pages need a value: all if ``everybody``, or if all show the metric; else those showing ``ref``."""
         channel = _channel(metric)
         everybody = everybody or channel in FLEET
         for interest in self.interests:

@@ -153,7 +153,7 @@ def with_name(raw: bytes, name: str) -> bytes:
 
 
 def _inner(payload: Any) -> Any:
-    """Return the value inside ``{"t": …, "value": …}``, or a payload without that."""
+    """Return the value inside ``{"t": …, "value": …}``, or a payload of another form as it is."""
     return payload["value"] if isinstance(payload, dict) and "value" in payload else payload
 
 

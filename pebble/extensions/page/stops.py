@@ -209,7 +209,7 @@ class Stops:
 
 
 def _worth(stop: _PressedStop) -> tuple[bool, bool, bool]:
-    """Return a sort key for removal: stops that are over, then of robots never heard, of one robot, of all."""
+    """Return a key that sorts stops for removal: over; of a robot never heard; of one robot; of all robots."""
     is_of_all = stop.ref == ""
     robots = stop.sender.robots.values()
     was_heard = is_of_all or any(robot.live or robot.estop.has_capabilities for robot in robots)

@@ -32,10 +32,10 @@ _RUN_S = 1.0  # late commands that are further apart are no run
 
 
 class _Rule(Struct, frozen=True):
-    """A rule for leaving a level: down at ``worse_s`` of queue in two of three answers, up after ``rise_s`` without."""
+    """A rule for leaving a level, by the time for which answers to pings waited in a queue."""
 
-    worse_s: float
-    rise_s: float
+    worse_s: float  # if two of three waited longer, the level falls
+    rise_s: float  # if there was no queue for so long, it rises
 
 
 _RULES: dict[LinkLevel, _Rule] = {

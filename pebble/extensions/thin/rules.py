@@ -8,7 +8,7 @@ _LINK: Path = ("services", "mqtt_bridge", "link")
 
 
 def _check(reader: Reader, root: Root, _: Path) -> Root:
-    """Note a problem if a group of commands would not tell for which serial line it is."""
+    """Note a problem if groups of commands are permitted, and serial lines have different topics of drive commands."""
     serial = root.services.serial_mcu_bridge
     topics = {line.topics.drive_values for line in (serial, *serial.instances.values())}
     if root.services.mqtt_bridge.link.groups and len(topics) > 1:

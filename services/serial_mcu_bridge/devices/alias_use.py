@@ -40,7 +40,7 @@ class AliasUse:
             self.update()
 
     def update(self) -> None:
-        """Use the aliases that no other device claims, and release the rest: of two devices neither uses it."""
+        """Use aliases that no other device claims, and release the rest: of two claimants neither uses the alias."""
         if self._device is None:
             return
         for route in self._device.routes.values():

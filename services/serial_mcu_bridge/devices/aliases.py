@@ -36,7 +36,7 @@ class Claims:
 def claims(manifest: McuManifest, lookup: Lookup = c.channel_of) -> Claims:
     """Return the claims of a manifest. Every process that reads the manifest comes to the same result.
 
-    ``lookup`` finds the robot's channel under a suffix, renamed ones included.
+    ``lookup`` returns the robot's channel with the topic that a claim names, renamed or not; None if there is none.
     """
     granted: dict[str, str] = {}
     refused: dict[str, str] = {}
@@ -54,7 +54,7 @@ def claims(manifest: McuManifest, lookup: Lookup = c.channel_of) -> Claims:
 
 
 def outlet_feature(claim: str) -> set[str]:
-    """Return the feature of a robot while ``claim`` is in use, such as ``outlets/o1/status``; empty for others."""
+    """Return the feature that a robot has while ``claim`` is in use: ``outlets/o1/status``; empty if no outlet."""
     return {claim.partition("/")[2]} if c.channel_of(claim) in (c.OUTLET_STATUS, c.OUTLET_COMMAND) else set()
 
 

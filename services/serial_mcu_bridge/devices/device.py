@@ -126,7 +126,7 @@ class Device:
         return replace(interface, channel=self._addresses[channel].topic.removeprefix(outgoing))
 
     def _robots_channel(self, suffix: str) -> c.Channel | None:
-        """Return the robot's channel at ``suffix``, by the config or else by the contract; None if there is none."""
+        """Return the channel of a topic below the robot's base, by the config or else by the contract, or None."""
         return self._addresses.channel(f"{self._addresses.base}/{suffix}") or c.channel_of(suffix)
 
 

@@ -98,8 +98,8 @@ class SerialLine:
     def drive(self, line: bytes, valid_s: float = float("inf"), *, replaces: str = "") -> bool:
         """Send a drive line now, or after earlier bytes unless a newer one replaces it; False if there is no device.
 
-        If it could not be sent for ``valid_s``, or for ``drive_timeout_s``, a stop is sent instead. ``line`` may
-        also hold a line of the kind ``replaces``, which expires with it; a waiting line of that kind is dropped.
+        If it could not be sent for ``valid_s``, or for ``drive_timeout_s``, a stop is sent instead. ``replaces``: the
+        kind of a second line, such as one for lights, that ``line`` also holds; a waiting line of that kind is dropped.
         """
         outbox = self.output.outbox
         at_once = line if valid_s > 0 else b""  # else the outbox judges whether it has expired

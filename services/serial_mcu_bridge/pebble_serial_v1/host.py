@@ -55,7 +55,7 @@ class Send:
 
 @dataclass(frozen=True, slots=True)
 class Described:
-    """An event: the MCU's manifest is known; ``remembered``: from an earlier DESCRIBE, as a HELLO names it."""
+    """An event: the MCU's manifest is known; ``remembered``: from an earlier DESCRIBE, after the same HELLO."""
 
     manifest: Manifest
     remembered: bool = False

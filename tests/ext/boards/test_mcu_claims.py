@@ -15,22 +15,24 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from pebble.config import SerialBridge
+from pebble.config import SerialBridge, parse
 from pebble.contract import DRIVE, MCU_DESCRIBE, codec
 from pebble.contract.payloads import McuManifest
 from pebble.extension import ours
 from pebble.extensions.lab.simulation.pty import PtyMcu
+from pebble.runtime.addresses import Addresses
 from pebble.services.serial_mcu_bridge.devices.aliases import claims
+from pebble.services.serial_mcu_bridge.devices.device import Device
 from pebble.services.serial_mcu_bridge.devices.peers import CONFIRM_S, PeerDevices
 from pebble.services.serial_mcu_bridge.devices.private_topics import LocalOnly
-from pebble.services.serial_mcu_bridge.imu.reports import ImuWatchdog
+from pebble.services.serial_mcu_bridge.imu.reports import ImuReports, ImuWatchdog
 from pebble.services.serial_mcu_bridge.pebble_serial_v1 import frame, manifest
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import parse_describe
 from pebble.transports import Message, QoS
 from tests.ext.boards import mcu_wire as wire
 from tests.ext.boards.mcu_wire import IMU, LAMP, STATION, F, I, M, Received
 from tests.kit.board import SerialRig, motion
-from tests.kit.robot import BASE
+from tests.kit.robot import BASE, ROBOT
 from tests.support import ROOT, cases, until
 
 # -- claims
@@ -85,6 +87,12 @@ def test_which_channels_are_refused_with_which_reason() -> None:
     assert [reason for reason in (*reasons, renamed.refused["a"]) if "robot's own" not in reason] == []
     for profile in ("", "imu.motion.v1"):
         assert "it needs the profile imu." in refused(state("a", "sensors/imu", profile=profile))
+    topics = {"drive_values": f"{BASE}/incoming/elsewhere"}
+    raw = {"robot": {"id": ROBOT}, "services": {"serial_mcu_bridge": {"topics": topics}}}
+    config = parse(raw, folder=Path("/"), env={})
+    wheels = M("u", (command("a", "elsewhere"), command("b", "drive-values", 2))).describe()
+    device = Device(parse_describe(wheels), Addresses(config), ImuReports(SerialBridge(), ""))
+    assert device.claims.refused.keys() == {"a", "b"}, "both the topic of the config and that of the contract"
 
 
 def test_a_local_only_interface_gets_no_public_channel_without_a_device_uid() -> None:
@@ -196,7 +204,7 @@ def cleared(metric: str) -> Message:
 
 FAST, SLOW = ("mcu/spy-1/fast", "lab/fast"), ("mcu/spy-1/slow", "lab/slow")
 KNOWN = local_only(*LISTED)
-NONSENSE = (b"", b"{", b'{"device_uid": 5}', b'["device_uid"]', b"\xff\xfe", sample("slow"))
+NONSENSE = (b"", b"{", b'{"device_uid": 5, "interface": "a"}', b'["device_uid"]', b"\xff\xfe", sample("slow"))
 #: What is offered one after the other, and what passes then: the message, nothing, or the topics that are named.
 HISTORIES: dict[str, list[tuple[Message, bool | list[str]]]] = {
     "what is listed stays, and what is not passes": [

@@ -17,7 +17,7 @@ from pebble.errors import PayloadError, PebbleError
 from pebble.extensions.media import opus, sound
 from pebble.extensions.media.opus import milliseconds
 from pebble.extensions.media.packets import Sound
-from pebble.extensions.media.pcm import Resampler, Samples, remix, to_bytes, to_samples
+from pebble.extensions.media.pcm import Resampler, Samples, remix, to_bytes, to_int16, to_samples
 from pebble.extensions.media.sound import (
     SOUND_ENCODINGS,
     ReceivedSound,
@@ -223,6 +223,7 @@ def test_remixing() -> None:
     assert remix(stereo, 1).tolist() == [[200], [-32768]]
     assert remix(stereo[:, :1], 2).tolist() == [[100, 100], [-32768, -32768]]
     assert to_samples(b"\1\0\2\0\3\0\4", 2).tolist() == [[1, 2]], "an unfinished sample is left out"
+    assert to_int16(np.array([-4e4, -0.6, 4e4])).tolist() == [-32768, -1, 32767], "clipped, never turned over"
     assert make_sound_encoder("opus", rate=16000, channels=6).channels == 1
 
 

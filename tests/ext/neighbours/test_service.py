@@ -21,12 +21,13 @@ from pebble.contract.payloads import SCRIPT, Drive, EstopState, Neighbours, Whee
 from pebble.errors import ConfigError, PebbleError
 from pebble.extensions.scripts.runs import LocalScripts
 from pebble.extensions.scripts.script import NotGrantedError, Robot, Stopped
+from pebble.extensions.scripts.script.neighbour import PRESENT_S
 from pebble.motion.arbiter import PERSON, Arbiter
 from pebble.motion.latch import Latch
 from pebble.motion.lease import Lease
 from pebble.services.neighbours.begun import begin
 from pebble.services.neighbours.config import MOST_METRICS, MOST_NEIGHBOURS
-from pebble.services.neighbours.service import MOST_BYTES, NeighboursService
+from pebble.services.neighbours.service import HEARTBEAT_S, MOST_BYTES, NeighboursService
 from pebble.services.neighbours.visit import Visit
 from pebble.transports import Message, QoS, Transport, clock
 from pebble.transports.memory import MemoryHub, MemoryTransport
@@ -208,6 +209,7 @@ def test_operators_see_who_receives_what_and_who_drives(pair: Pair) -> None:
     pair.robot.neighbour("fred").drive(z=0.4)
     assert until(lambda: pair.fred.state.driven_by == "goob")
     assert pair.fred.state.commanded == {"goob": ["drive-values"]}
+    assert 3 * HEARTBEAT_S < PRESENT_S, "two lost messages leave it present"
 
 
 # -- what is refused in `services.neighbours`
@@ -359,7 +361,7 @@ ENDS: dict[str, tuple[Happens, bool]] = {
     "a script of fred's own": (Fred.script, False),
     "a script of fred's own that has ended": (Fred.script_ended, True),
     "a newer run of goob": (lambda fred: fred.goob(run=8), True),
-    "a run of another robot": (lambda fred: fred.goob(run=3, name="ann"), True),
+    "a run of another robot": (lambda fred: fred.goob(run=1, name="ann"), True),
     "a damaged file at a restart": (Fred.restart_unread, False),
 }
 
@@ -376,6 +378,11 @@ def test_what_ends_a_run_ends_it_for_good_and_a_new_start_drives(fred: Fred, wha
     assert fred.visit.refused(fred.now)["goob"].run == 7
     fred.goob(run=9)
     assert bool(fred.moved) == drives_again
+
+
+def test_a_damaged_file_of_runs_is_named_with_the_fix(tmp_path: Path) -> None:
+    (file := tmp_path / "runs.json").write_text("{")
+    assert begin(file, NAMES, "goob", 7).startswith(f"{file} cannot be read (it is damaged): delete it")
 
 
 def test_fred_s_own_script_is_never_barred(fred: Fred) -> None:

@@ -61,15 +61,17 @@ def make(local: Broker, monkeypatch: pytest.MonkeyPatch) -> Iterator[Make]:
 
 
 DEAF = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
+POLITE = "import signal, sys; signal.signal(signal.SIGTERM, lambda *_: sys.exit(print('goodbye')))\n"
 
 
-def test_the_program_ends_with_all_it_started_also_if_it_does_not_want_to(make: Make) -> None:
-    stream = make(sys.executable, "-c", DEAF + STREAMER)
+@pytest.mark.parametrize(("manner", "last"), [(DEAF, ""), (POLITE, "goodbye")])
+def test_the_program_ends_with_all_it_started_also_if_it_does_not_want_to(make: Make, manner: str, last: str) -> None:
+    stream = make(sys.executable, "-c", manner + STREAMER)
     pids = stream.pids()
     assert not any(gone(pid) for pid in pids)
     assert stream.process.end() == 0
     assert until(lambda: all(gone(pid) for pid in pids))
-    assert "streaming as pit ''" in stream.process.stdout.read() + stream.process.printed
+    assert f"streaming as pit ''\n{last}" in stream.process.stdout.read() + stream.process.printed
 
 
 def test_a_killed_service_leaves_no_program(make: Make) -> None:

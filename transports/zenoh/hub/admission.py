@@ -32,7 +32,7 @@ class Admission:
         self._logged: set[str] = set()
 
     def newest(self) -> object:
-        """Return the source of the rules for other machines; a different object means that it has changed."""
+        """Return the newest rules for other machines: the same object until they change. None: there are none."""
         return None
 
     def rules(self) -> Mapping[str, Any]:

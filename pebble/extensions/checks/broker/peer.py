@@ -262,8 +262,8 @@ class BrokerTrial:
     def wait(self, condition: Callable[[], object], seconds: float | None = None) -> bool:
         """Serve all peers until ``condition`` holds; return False if it does not in time.
 
-        ``seconds``: instead of the usual time of a broker's answer. After that time a broker may still be busy: then it
-        has several times as long to answer a ping, and what was sent before that.
+        ``seconds``: the longest wait. None: the usual time of a broker's answer. Then, in case the broker is busy, a
+        ping is sent, and the wait goes on until it is answered, but at most several times as long.
         """
         if self._serve(condition, self.answer_s if seconds is None else seconds):
             return True

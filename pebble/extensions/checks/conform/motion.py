@@ -73,7 +73,7 @@ def _swings(readings: list[tuple[float, Any]]) -> Iterator[float]:
 
 
 def _wheel_reports(robot: Observer) -> list[tuple[float, list[float]]]:
-    """Return the wheel speeds that were seen from outside, or else reported, each with its time."""
+    """Return the wheel speeds, each with its time: those that ``robot.eyes`` saw; if it saw none, the reported ones."""
     reports = [(report.at, report.value.value.get("wheels")) for report in robot.of(c.STATUS) if report.value]
     return robot.eyes() or [(at, wheels) for at, wheels in reports if _are_wheels(wheels)]
 

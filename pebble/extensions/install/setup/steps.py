@@ -196,7 +196,7 @@ class Job:
         )._replace(restarts=(BROKER_SERVICE,))
 
     def _other_broker(self) -> Iterator[Step]:
-        """Yield the steps that end the robot's own broker, and write the authority of another one."""
+        """Yield the steps that end the robot's own broker, and write the certificate of another broker's authority."""
         broker_conf = self.places.broker
         if broker_conf.exists():
             yield Step("the robot's own broker ends", lambda: False, broker_conf.unlink, (BROKER_SERVICE,))

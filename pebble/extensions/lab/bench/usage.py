@@ -13,7 +13,7 @@ _AT_ONCE_NS = 20_000
 def cpu_s(pids: Iterable[int]) -> float:
     """Return the CPU seconds of these processes so far, all threads, user and system; 0 for ended processes.
 
-    In nanoseconds: /proc counts in ticks of 10 ms, too coarse for slices of less than a second.
+    The resolution is a nanosecond: /proc counts in ticks of 10 ms, too coarse for slices of less than a second.
     """
     seconds = 0.0
     for pid in pids:

@@ -23,7 +23,7 @@ _LARGEST = 4096  # bytes of a heartbeat or status that are looked at
 def announced(base: str, payload: bytes) -> dict[str, Any]:
     """Return the capabilities that follow from ``"subscribes": ["incoming/drive-values", …]``; empty without a list.
 
-    Their ``announced`` is true: by it a page tells the robot's maker to publish capabilities. Whole topics in the list
+    Their ``announced`` is true: so a page tells the robot's maker to publish capabilities. Whole topics in the list
     are ignored, also the robot's own.
     """
     if len(payload) > _LARGEST or b'"subscribes"' not in payload:

@@ -25,8 +25,8 @@ _DRIVES = msgspec.json.encode({"subscribes": [DRIVE.suffix]})
 def assumed(base: str, axes: Collection[str], name: str = "") -> dict[str, Any]:
     """Return the assumed capabilities: a name, and driving if there are any ``axes``.
 
-    Besides ``assumed`` they have ``announced``, even if they are only a name: by it a page still tells the board's
-    maker to publish capabilities, and the subscriptions that the board lists later replace them.
+    They have ``assumed`` and ``announced``. Because of ``announced`` a page tells the board's maker to publish
+    capabilities, and subscriptions that the board lists later replace what is assumed.
     """
     value = announced(base, _DRIVES) if axes else {}
     if axes:

@@ -79,7 +79,7 @@ class RobotStop:
 
     @property
     def progress(self) -> Progress:
-        """Return how far the robot's stop has got. A robot that its sender names is never spared."""
+        """Return how far the robot's stop has got; SPARED only if the stop is for all robots, not for named ones."""
         if self.confirmed_s is not None:
             return Progress.CONFIRMED
         if self.estop.has_capabilities and not (self.estop.available or self.estop.drives or self._order.named):

@@ -70,10 +70,10 @@ class MediaReceiver:
             subscription.close()
 
     def on_picture(self, picture: Decoded) -> None:
-        """Handle a picture; override it to get all of them. Called on a thread of the transport."""
+        """Handle a picture; override this method to get all pictures. Called on a thread of the transport."""
 
     def on_sound(self, received: ReceivedSound) -> None:
-        """Handle a packet of sound; override it to get them. Called on a thread of the transport."""
+        """Handle a packet of sound; override this method to get all packets. Called on a thread of the transport."""
 
     # -- the transport's threads
 

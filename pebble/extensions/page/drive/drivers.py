@@ -21,7 +21,7 @@ from pebble.transports import Message
 from pebble.transports.clock import since_boot as clock
 
 MOST_WISHES = 16  # of one tab: robots of which it has control, or asks for it
-_ALONE_S = 1.0  # after a group its lights are sent again, by themselves, unless newer ones are there
+_ALONE_S = 1.0  # after a group its lights are sent again, alone, unless newer ones are there
 
 
 class _Lights(NamedTuple):
@@ -158,7 +158,7 @@ class Drivers:
     # -- what is due
 
     def tick(self, now: float) -> None:
-        """Publish what is due; send lights again by themselves, as the group that had them may be lost or refused."""
+        """Publish what is due. Lights that were sent in a group are also sent alone: a group may be lost or refused."""
         for ref, robot in list(self._driven.items()):
             self._publish_due(robot, now)
             if robot.may_be_forgotten(now):

@@ -90,7 +90,7 @@ class MediaHub(Streams[PictureStream]):
             self._looking.pop(ref, None)
 
     def _forget(self, ref: str, task: asyncio.Task[None]) -> None:
-        """Keep the last key frame of a stream that has ended."""
+        """Forget a stream that has ended, but keep its last key frame."""
         if (key := self._key(ref)) is not None:
             self._last.pop(ref, None)  # so that it is the newest in the table
             self._last[ref] = key

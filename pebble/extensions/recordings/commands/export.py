@@ -116,7 +116,7 @@ def _export(
 
 
 def _import(lines: Iterable[Recorded | BadLine], copy: Copy) -> Counter[str]:
-    """Add the messages of the lines to a recording; return how many there were, bad lines and cut payloads."""
+    """Add the messages of the lines to a recording; return the numbers of messages, bad lines and cut payloads."""
     counted = Counter[str]()
     for line in lines:
         if isinstance(line, BadLine):

@@ -20,8 +20,8 @@ class Disk:
 def surplus(entries: Iterable[Entry], options: Options, disk: Disk) -> list[Entry]:
     """Return the files to delete now: the oldest first, pictures and sound before state.
 
-    Files that are being written, and damaged ones, are never among them: damaged ones may hold what could not be read
-    yet, and do not count. The newest file of each kind stays.
+    Files that are being written are never among them. Nor are damaged ones, which may hold what could not be read yet;
+    they do not count towards ``keep_bytes``. The newest file of each kind stays.
     """
     listed = [entry for entry in entries if entry.is_active or entry.is_finished]
     used, free, has_inodes = sum(entry.size for entry in listed), disk.free_bytes, disk.has_inodes

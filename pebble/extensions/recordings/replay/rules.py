@@ -202,7 +202,7 @@ def _rebased(plain: Any, old: str, new: str) -> Any:
 
 
 def _is_elsewhere(key: str, value: Any, below: str) -> bool:
-    """True if ``value``, by its ``key`` or form, is a topic not ``below`` the base: a config may name such topics."""
+    """True if ``value``, by ``key`` or form, is a topic that does not begin with ``below``: configs may set such."""
     if not isinstance(value, str):
         return False
     return not value.startswith(below) and (key.endswith("topic") or parse_topic(value) is not None)

@@ -119,7 +119,7 @@ def _bandwidth(robot: RobotTraffic) -> Figure | None:
 
 
 def draw_bandwidth(axes: Axes, shown: Sequence[Bandwidth]) -> None:
-    """Draw the median and the 95th percentile of each family, in sessions and while idle."""
+    """Draw the median and the 95th percentile of each kind of message (``family``), in sessions and while idle."""
     present = {bandwidth.family for bandwidth in shown}
     names = [family for family in reversed(FAMILIES) if family in present]
     for time, label, colour, offset, marker in _TIMES:

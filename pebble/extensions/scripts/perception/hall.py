@@ -67,7 +67,7 @@ class SensorRange:
         return max(-1.0, min(1.0, (value - middle) / swing))
 
     def _end_of_half_wave(self, value: float) -> None:
-        """Count the extremum, and move its end of the range a little to it: the signal may have become smaller."""
+        """Count the extreme value, and move that end of the range a little towards it: the signal may now be less."""
         self.extrema += 1
         if self._rising:
             self.high += _FADE * (self._pivot - self.high)

@@ -149,7 +149,7 @@ class Robot:
     def on(self, channel: Channel, handler: Callable[..., None]) -> None:
         """Call ``handler`` with each payload of ``channel``, on a thread of its own.
 
-        For a pattern channel, the names in the topic are arguments too. If it is slow, the oldest messages are dropped.
+        For a pattern channel, the names in the topic are arguments too. If the handler is slow, the oldest are dropped.
         """
         self._check()
         self._subscribe(channel, handler)

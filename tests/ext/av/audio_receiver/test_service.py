@@ -138,6 +138,20 @@ def test_received_speech_is_played_and_garbage_and_retained_packets_are_not(
     assert best_match(recorder.samples()[:28000], np.pad(speech, (8000, 8000))) > 0.95
     assert robot.reported(encoding="pcm", last_error=None, doing="plays 16 kHz, 1 channel")
     assert until(lambda: (robot.newest.bitrate or 0) > 0)
+    before = robot.newest.dropped or 0
+    burst = make_sound_encoder("pcm", rate=16000, channels=1, numbers=operator.numbers)
+    for number, packet in enumerate(burst.encode(bytes(200 * 640), time.time_ns() // 1_000_000)):
+        time.sleep(0.1 * (number % 40 == 0))  # no more at once than wait for the thread that plays
+        operator.send(packet)
+    assert until(lambda: (robot.newest.dropped or 0) > before + 100)
+    used_s, seen = cpu_s(robot.process.pid), len(robot.reports)
+    assert until(lambda: len(robot.reports) >= seen + 2)
+    assert cpu_s(robot.process.pid) - used_s < 0.5, "it waits for packets"
+
+
+def cpu_s(pid: int) -> float:
+    user, system = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:13]
+    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
 
 
 def test_another_player_begins_after_a_change_of_format_and_when_it_dies_or_hangs(

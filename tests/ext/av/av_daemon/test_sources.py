@@ -70,11 +70,16 @@ def alsa_microphone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, opened: lis
 
 class TestLibcamera:
     def test_pictures_come_and_their_counter_advances(
-        self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, opened: list[Source]
+        self,
+        monkeypatch: pytest.MonkeyPatch,
+        tmp_path: Path,
+        opened: list[Source],
+        caplog: pytest.LogCaptureFixture,
     ) -> None:
         """Also of the older program, and by another name of the backend."""
         Installed(monkeypatch, tmp_path, "libcamera-vid", "tests.fakes.fake_rpicam")
-        camera = sources.camera(options(video={**SMALL, "backend": "picamera2"}), 0.0)()
+        video = {**SMALL, "backend": "picamera2", "capture_format": "yuyv"}
+        camera = sources.camera(options(video=video), 0.0)()
         opened.append(camera)
         frames = [grabbed(camera) for _ in range(8)]
         numbers = [read_counter(picture(data, info)) for info, data in frames]
@@ -84,6 +89,11 @@ class TestLibcamera:
         assert (info.width, info.height) == (320, 240)
         assert (data[:2].tobytes(), data[-2:].tobytes()) == (b"\xff\xd8", b"\xff\xd9")
         assert (info.format, info.stride) == ("mjpeg", 0), "its own JPEG is passed on as it is"
+        assert "capture_format yuyv does nothing" in caplog.text
+        pictures = TestJpegSplitter.PICTURES
+        monkeypatch.setattr(LibcameraCamera, "read", lambda _self: b"".join(pictures))
+        capture = camera.grab()
+        assert (capture.data, capture.skipped) == (pictures[-1], 2)
 
     def test_a_wait_can_be_interrupted_and_leaves_no_thread(
         self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
@@ -158,6 +168,9 @@ class TestAlsa:
         monkeypatch.setattr(alsa.AlsaMicrophone, "read", lambda _self: sound)
         capture = alsa_microphone().grab()
         assert (capture.data, capture.skipped) == (sound[-640:], 14)
+        monkeypatch.setattr(alsa.AlsaMicrophone, "read", lambda _self: sound[: 640 * 5])
+        at_ns = alsa_microphone().grab().at_ns
+        assert 4 * 20_000_000 <= time.monotonic_ns() - at_ns < 5_000_000_000, "others came after it"
 
 
 @pytest.fixture(scope="session")
@@ -241,6 +254,11 @@ class TestSynthetic:
         with pytest.raises(DeviceError):
             list(iter(source.grab, None))
 
+    def test_speech_was_recorded_when_its_time_says(self) -> None:
+        capture = SyntheticMicrophone(options().audio, began := time.monotonic()).grab()
+        turn = round((capture.at_ns / 1e9 - began) / alsa.CHUNK_S)  # the chunk is complete by then
+        assert np.array_equal(capture.data, Speech(16_000).samples(320 * (turn - 1), 320))
+
 
 class TestPacer:
     def paced(self, rate: float, *, behind: int = 0) -> tuple[Pacer, list[float]]:
@@ -274,7 +292,7 @@ class TestJpegSplitter:
 
     def test_a_preview_inside_ends_no_picture_and_what_is_none_is_skipped(self) -> None:
         preview = b"\xff\xe1" + (len(self.PICTURES[0]) + 2).to_bytes(2) + self.PICTURES[0]
-        whole = self.PICTURES[1][:2] + preview + self.PICTURES[1][2:]
+        whole = self.PICTURES[1][:2] + b"\xff\x01" + preview + self.PICTURES[1][2:]
         assert JpegSplitter().feed(whole + self.PICTURES[2]) == [whole, self.PICTURES[2]]
         splitter = JpegSplitter(limit=10_000)
         stream = b"garbage" + self.PICTURES[0] + b"\xff\xd8 no picture \xff" + self.PICTURES[1]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ import numpy as np
 import pytest
 
 from pebble.config import parse
-from pebble.errors import PebbleError
+from pebble.errors import PayloadError, PebbleError
 from pebble.extensions.media.decode import VideoDecoder
 from pebble.extensions.media.frames import Frame, FrameInfo
 from pebble.extensions.media.scene import Scene
@@ -93,6 +94,12 @@ def test_what_is_sent_has_the_wanted_size(
     assert (picture.shape[1], picture.shape[0]) == size
 
 
+def test_a_frame_without_a_size_is_refused() -> None:
+    empty = Frame(FrameInfo(format="bgr24", width=0, height=48), np.zeros(0, np.uint8), shared=False)
+    with pytest.raises(PayloadError, match="a picture of 0x48 pixels"):
+        Shape(None, None, 0).picture(empty)
+
+
 class Doubtful(Frame):
     """A view whose memory was given to another frame while it was looked at."""
 
@@ -159,6 +166,7 @@ def bench(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Bench]:
     bench = Bench(monkeypatch, tmp_path)
     yield bench
     bench.close()
+    assert "pebble-camera" not in [thread.name for thread in threading.enumerate()]
 
 
 @pytest.mark.parametrize(

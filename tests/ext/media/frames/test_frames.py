@@ -152,6 +152,7 @@ def test_readers_and_writers_that_are_killed_are_noticed_and_their_segments_swep
     writer.kill()
     writer = net.writer(size=SMALL)
     all_receive(2)
+    assert len(StreamNames(net.folder, "camera").lock_paths()) == 1, "that of the killed writer is gone"
     maps = [line for peer in (writer, *readers) for line in Path(f"/proc/{peer.pid}/maps").read_text().splitlines()]
     used = {SHM / Path(line.split()[5]).name for line in maps if ".zenoh" in line}
     assert len(used) >= 2

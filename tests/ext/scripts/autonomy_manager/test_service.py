@@ -369,9 +369,10 @@ def test_where_names_are_checked_only_who_has_control_starts_a_script(tmp_path: 
 def test_a_start_waits_until_its_script_is_listed_unless_something_comes_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, between: Callable[[Bench], None], status: dict[str, Any]
 ) -> None:
-    lists = threading.Event()
+    lists, scans = threading.Event(), list[Catalogue]()
 
-    def scan(_catalogue: Catalogue, found: Callable[[dict[str, Script]], None]) -> None:
+    def scan(catalogue: Catalogue, found: Callable[[dict[str, Script]], None]) -> None:
+        scans.append(catalogue)
         assert lists.wait(WAIT_S)
         found(SCRIPTS)
 
@@ -388,5 +389,6 @@ def test_a_start_waits_until_its_script_is_listed_unless_something_comes_first(
         bench.advance(0.11)
         assert bench.becomes(**status)
         assert len(bench.children.all) == bool(status.get("running"))
+        assert len(scans) < 4, "the scripts are listed every three seconds"
     finally:
         bench.close()

@@ -108,7 +108,7 @@ class ViewerQueue:
         self.waiting = True
 
     def not_drawn(self) -> None:
-        """Skip frames up to the next key frame, as the page could not draw one; not if that key frame is on its way."""
+        """Skip frames up to the next key frame, unless one waits or is on its way: the page could not draw a frame."""
         frames_under_way = [frame for _, frame in self._under_way.values()]
         if not any(frame.keyframe for frame in (*frames_under_way, *self._queue)):
             self.wait_for_keyframe()

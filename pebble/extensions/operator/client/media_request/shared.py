@@ -149,7 +149,7 @@ class SharedRequest:
         return idle and (self._broker.connected or self._request is None)
 
     async def _pause(self, began: float) -> None:
-        """Pause until 0.5 s after ``began``, when the last step began; after a wake only until 0.1 s after it."""
+        """Pause until 0.5 s after the last step ``began``. A wake ends the pause, but not within 0.1 s of ``began``."""
         await asyncio.sleep(max(0.0, began + TICK_S / 5 - time.monotonic()))
         with contextlib.suppress(TimeoutError):  # wait_for of Python 3.11 loses a cancellation that meets a wakeup
             async with asyncio.timeout(max(0.001, began + TICK_S - time.monotonic())):
