@@ -48,7 +48,7 @@ class Arbiter:
 
         ``moves``: any axis is not 0. ``run`` may be PERSON, or UNKNOWN_RUN for a zero. ``valid_ms`` < 0: not given.
         ``key`` and ``by`` are as in the lease; ``by`` None: a program of the robot, which needs no key. Where names are
-        not checked, scripts need none either. A zero of a client without control ends a script, even one that waits,
+        not checked, scripts need no key either. A zero of a client without control ends a script, also a waiting one,
         but it is not the zero for which the latch waits after a reset.
         """
         self.tick(now)

@@ -31,7 +31,7 @@ class Admission:
         return len(self._flags)
 
     def refuse(self, side: Side, subject: Subject, message: Message, topic: str, *, named: bool = True) -> Drop | None:
-        """Return why this message may not pass to ``topic``; None if it may. Hot.
+        """Return why this message may not pass to ``topic``; None if it may. Must be fast.
 
         Counts the message if its kind is limited, and remembers an unknown flag. ``named`` is False if topics
         must name the sender's account, and this one does not: such messages have a limit of their own.

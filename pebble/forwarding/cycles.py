@@ -85,7 +85,7 @@ class Cycles:
         self.closed_ways: Final[set[tuple[Side, str]]] = set()
 
     def examine(self, side: Side, subject: Subject, message: Message) -> Finding:
-        """Return the finding about a message from ``side`` that may be forwarded. Hot.
+        """Return the finding about a message from ``side`` that may be forwarded. Must be fast.
 
         Counts the message, notes an answered probe. Messages that start something may pass even if they circulate.
         """

@@ -178,7 +178,7 @@ class Forwarder:
     # -- the receiving threads
 
     def skips_retained(self, side: Side, topic: bytes) -> bool:
-        """True if retained messages of ``topic`` do not pass; counts and logs this message then. For TopicPolicy."""
+        """True if retained messages of ``topic`` do not pass: then counts and logs the present one. For TopicPolicy."""
         if self._names is not None and topic.endswith(_STOP) and self._is_stop(topic.decode(errors="replace")):
             return False  # it may be a live stop, with a name in its topic
         kind = self.subjects.invented(topic)  # a flag or a command that the contract does not know
@@ -230,7 +230,7 @@ class Forwarder:
     def admit(
         self, source: SideState, subject: Subject | None, message: Message, topic: str, named: bool
     ) -> Forward | Drop:
-        """Return how to forward ``message``, or why it does not pass. Hot.
+        """Return how to forward ``message``, or why it does not pass. Must be fast.
 
         ``topic`` is the topic on the other side. ``named`` is True if the sender has an account, or names do not count.
         """
@@ -299,7 +299,7 @@ class Forwarder:
     def pass_now(
         self, source: SideState, subject: Subject, message: Message, forward: Forward, account: str = ""
     ) -> Forward | Drop:
-        """Publish an admitted message on the other side, or return why not. Hot.
+        """Publish an admitted message on the other side, or return why not. Must be fast.
 
         ``account`` is the account of the sender, where names are checked.
         """

@@ -238,7 +238,7 @@ class Client:
         return self._mid
 
     def _send(self, data: bytes) -> None:
-        """Send bytes, or let them wait behind earlier ones. Hot."""
+        """Send bytes, or let them wait behind earlier ones. Must be fast."""
         if self.socket is None:
             return
         if not self.waiting:

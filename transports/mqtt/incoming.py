@@ -207,7 +207,7 @@ class Incoming:
             self.age.delay.acknowledged(sent_at, now)
 
     def on_publication(self, topic: bytes, payload: bytes, first: int) -> None:
-        """Make a message of a PUBLISH packet, with its age, and keep it for delivery. Hot."""
+        """Make a message of a PUBLISH packet, with its age, and keep it for delivery. Must be fast."""
         age, retain = self.age, bool(first & RETAIN)
         if retain:
             age.has_retained = True

@@ -179,7 +179,7 @@ class InFlightTable:
             self._unconfirmed[message.topic] = _Unconfirmed(message)
 
     def sent(self, message: Message, mid: int, now: float) -> None:
-        """Note that ``message`` was written with the id ``mid``. Hot."""
+        """Note that ``message`` was written with the id ``mid``. Must be fast."""
         size, accepted = len(message.payload), self._accepted.get(message.topic)
         if accepted is None or size > accepted[1]:
             _note(self._written, message.topic, now, size)

@@ -84,7 +84,7 @@ def connect(
 def publish(
     topic: str, payload: bytes, qos: int, mid: int, *, retain: bool, modern: bool, expires_s: int | None
 ) -> bytes:
-    """Return a PUBLISH; ``mid`` counts with QoS 1 only, ``expires_s`` with MQTT 5 only. Hot."""
+    """Return a PUBLISH; ``mid`` counts with QoS 1 only, ``expires_s`` with MQTT 5 only. Must be fast."""
     name = topic.encode()
     head = len(name).to_bytes(2, "big") + name
     if qos:
@@ -238,7 +238,7 @@ class Reader:
         self._data, self._at = data, 0
 
     def read(self, most: int) -> int:
-        """Give up to ``most`` whole packets to the listener; return how many. Raises MalformedError. Hot."""
+        """Give up to ``most`` whole packets to the listener; return how many. Raises MalformedError. Must be fast."""
         data, end, count = self._data, len(self._data), 0
         if not data:
             return 0
@@ -283,7 +283,7 @@ class Reader:
         self._data, self._at = b"", 0
 
     def _publish(self, data: bytes, first: int, start: int, stop: int) -> None:
-        """Give a PUBLISH, whose topic begins at ``start``, to the listener. Hot."""
+        """Give a PUBLISH, whose topic begins at ``start``, to the listener. Must be fast."""
         topic_end = start + 2 + int.from_bytes(data[start : start + 2], "big")
         payload_at, topic = topic_end, data[start + 2 : topic_end]
         qos = first & ANY_QOS

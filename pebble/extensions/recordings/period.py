@@ -28,10 +28,10 @@ _DAY: Final = timedelta(days=1)
 def parse_period(since: str | None, until: str | None, *, now: datetime) -> tuple[int, int]:
     """Return the period from ``since`` to before ``until``, in nanoseconds since 1970.
 
-    An empty text means 0, or FOREVER_NS. A time of day is the latest one that is not after ``now``; as ``until`` with a
-    ``since``, the first one after that. A day as ``until`` is included. Times without a zone are in that of ``now``, or
-    this machine's if that has none; one that occurs twice, because clocks are changed, is the first. Raises PebbleError
-    with one line that shows how to write it.
+    None means 0 as ``since``, FOREVER_NS as ``until``. A time of day is the latest one that is not after ``now``; as
+    ``until`` with a ``since``, the first one after that. A day as ``until`` is included. Times without a zone are in
+    that of ``now``, or this machine's if that has none; one that occurs twice, because clocks are changed, is the
+    first. Raises PebbleError with one line that shows how to write it.
     """
     since_ns = 0 if since is None else _since(*_zoned("--since", since.strip(), now))
     until_ns = FOREVER_NS

@@ -100,9 +100,9 @@ def following(run: int) -> int:
 def next_run(config: Config, barred: int = 0, received: int = 0) -> int:
     """Return the number of a run that starts now: newer than ``barred``, which motor owners report.
 
-    It is also above every earlier run of this robot and ``received``, the newest run whose commands have come, as far
-    as these are newer than ``barred``. A number far ahead, as a stranger may send it, counts as older and is left out:
-    the numbers go round.
+    It is also above every earlier run of this robot, and above ``received``, the newest run whose commands have come.
+    Of these, a number far ahead of ``barred``, as a stranger may send it, counts as older and is left out: the numbers
+    go round.
 
     Several processes may call this at once. If the file is missing or damaged, it counts from the clock. Raises
     PebbleError if another process does not release the file.

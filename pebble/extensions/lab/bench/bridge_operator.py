@@ -50,7 +50,7 @@ class Report(NamedTuple):
 
 
 class Arrived(NamedTuple):
-    """The messages of several turns that arrived."""
+    """The messages that arrived, of several turns of driving."""
 
     commands: Mapping[Wheels, int]  # when each reached the MCU
     reports: Sequence[Report]  # those whose values were sent once

@@ -190,7 +190,7 @@ def _listen(transport: Transport, base: str) -> tuple[Listener, threading.Thread
 
 
 def _until_due(sender: StopSender, *, has_heartbeats: bool) -> float:
-    """Return for how many seconds to wait for messages; less while heartbeats come on another connection."""
+    """Return how many seconds to wait for messages: fewer while the heartbeats' connection may show new robots."""
     most_s = _HEARD_S if has_heartbeats and sender.collecting else _TICK_S
     return most_s if sender.due is None else min(most_s, sender.due - time.monotonic())
 
