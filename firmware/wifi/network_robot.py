@@ -134,6 +134,7 @@ class NetworkRobot:
             granted = results[-len(client.topics) :]  # of all topics, with an account if names are checked
             if granted[_DRIVE] > 127:
                 raise ValueError("subscription refused")
+            # A stop counts without an account, too: its topic without one is among the first.
             self.stops.stoppable = results[_ESTOP] <= 127 and granted[_RESET] <= 127
             self.stops.controllable = granted[_CONTROL] <= 127
             self.groups = getattr(self.body, "groups", b"") if granted[-1] <= 127 else b""
@@ -142,7 +143,7 @@ class NetworkRobot:
         elif client.retained:  # stale
             self.refused += 1
         else:
-            self._obey(raw if kind == "publication" else None, now)
+            self._obey(raw if kind == "publication" else None, now)  # else "too long"
 
     def _obey(self, raw: memoryview | None, now: int) -> None:
         """Obey a command. ``raw`` None: the payload is too long."""

@@ -62,7 +62,7 @@ class Visit:
             return
         if isinstance(drive.run, int):
             self._received = newest((self._received, drive.run))
-        self._sender.receive(drive, now)
+        self._sender.receive(drive, now)  # one of a newer run here takes the place of this run
 
     def tick(self, now: float) -> None:
         self._sender.owners(self._states, now)

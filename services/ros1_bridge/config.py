@@ -270,7 +270,7 @@ def programs(config: Config) -> list[Program]:
 
 
 def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
-    """Return ``value`` with offers of the values that are published of the base."""
+    """Return the capabilities with the telemetry of the ROS base that this bridge publishes."""
     section = config.section(Ros1)
     if not section.enabled:
         return value

@@ -129,7 +129,7 @@ class Ros1Bridge(Ros1Reader, MotorOwner):
 
     @every(_CHECK_S)
     def report_base(self) -> None:
-        """Tell the launcher whether the base can be driven. Raises DeviceError if commands are no longer repeated."""
+        """Tell the launcher whether the ROS base can be driven. Raises DeviceError if nothing drives it any more."""
         if not self.cmd_vel.alive:
             raise DeviceError("the thread that sends commands has ended")
         report = self.assess()
