@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import io
-import os
 import random
 import signal
 import subprocess
@@ -31,7 +30,7 @@ from pebble.extensions.recordings.seek.days import Days
 from pebble.extensions.recordings.traffic.sources import sources
 from tests.commands.command_line import Run
 from tests.ext.recordings.messages import START_NS, STEP_NS, contents, read, write
-from tests.support import cases
+from tests.support import cases, refused
 
 GOOB, FRED = "pebble/robots/goob/outgoing/online", "pebble/robots/fred/outgoing/online"
 COUNT: Final = 40
@@ -113,7 +112,6 @@ DAMAGED: Final[dict[str, tuple[bytes, str]]] = {
 
 
 EXPECTED = [(FRED if number % 4 == 3 else GOOB, payload(number)) for number in range(COUNT)]
-OF_GOOB = [one for one in EXPECTED if one[0] == GOOB]
 pytest.importorskip("duckdb")
 pytest.importorskip("matplotlib")
 NAME = "20261122T100030Z-000001.state.mcap"
@@ -135,7 +133,7 @@ def test_a_file_of_another_program_is_read_in_the_order_of_time(tmp_path: Path, 
     assert exported(copy) == [(*SCHEMA, *one) for one in EXPECTED]
     archive = Archive(tmp_path / "rec")
     shown = archive.messages("pebble/robots/goob", 0, 1 << 63)
-    assert [(one.channel.topic, one.payload) for one in shown] == OF_GOOB
+    assert [(one.channel.topic, one.payload) for one in shown] == [one for one in EXPECTED if one[0] == GOOB]
     assert archive.unread() == {}
     archive.close()
     replayed = ReplaySource([path])
@@ -185,15 +183,11 @@ def on(folder: Path, command: list[str], out: Path) -> list[str | Path]:
     return [*group, command[0], folder, *(one.replace("{out}", str(out)) for one in command[1:])]
 
 
-@pytest.fixture
-def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reports without them, which take longest."""
-    monkeypatch.setattr("pebble.extensions.recordings.traffic.report.figures", lambda _: [])
-
-
-@pytest.mark.usefixtures("_no_figures")
 @pytest.mark.parametrize("name", DAMAGED)
-def test_what_cannot_be_read_is_named_and_not_touched(tmp_path: Path, run: Run, name: str) -> None:
+def test_what_cannot_be_read_is_named_and_not_touched(
+    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.setattr("pebble.extensions.recordings.traffic.report.figures", lambda _: [])  # which take longest
     data, wanted = DAMAGED[name]
     path = stored(tmp_path, data)
     unread = [line for day in Days(Archive(tmp_path / "rec")).all() for line in day.unread]
@@ -212,7 +206,7 @@ def test_a_flipped_bit_anywhere_costs_no_message_at_a_deletion(tmp_path: Path) -
     write(path, 60, channels=2, each=20)
     data, chance = path.read_bytes(), random.Random(1)
     expected = [one for one in contents(path) if "/r0/" not in one[0]]
-    refused = 0
+    left = 0
     for at in range(chance.randrange(7), len(data), cases(41, 7)):
         raw = flipped(data, at, chance.randrange(8))
         path.write_bytes(raw)
@@ -220,10 +214,10 @@ def test_a_flipped_bit_anywhere_costs_no_message_at_a_deletion(tmp_path: Path) -
             rewrite(path, path, keeps=lambda one: "/r0/" not in one.channel.topic)
         except RecordingError:
             assert path.read_bytes() == raw
-            refused += 1
+            left += 1
         else:
             assert contents(path) == expected, at
-    assert refused > 8
+    assert left > 8
 
 
 def test_without_the_package_the_extra_is_named(tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -232,10 +226,6 @@ def test_without_the_package_the_extra_is_named(tmp_path: Path, run: Run, monkey
     assert run(*on(tmp_path / "rec", WRITERS[0], tmp_path / "out")) == 1
     assert 'recordings need the package mcap: pip install "pebble-robot[record]"' in run.err
     assert path.read_bytes() == by_package()
-
-
-def _full(_descriptor: int) -> None:
-    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 class TestInterrupted:
@@ -250,7 +240,7 @@ class TestInterrupted:
     @pytest.mark.parametrize(
         ("fails", "problem"),
         [
-            ((rewriting.os, "fsync", _full), "No space left on device"),
+            ((rewriting.os, "fsync", refused(errno.ENOSPC)), "No space left on device"),
             ((RecordingWriter, "finish", lambda _writer: None), "cannot be read again"),
             ((rewriting.shutil, "disk_usage", lambda _folder: SimpleNamespace(free=1000)), "there is no room"),
         ],

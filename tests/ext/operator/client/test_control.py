@@ -14,8 +14,7 @@ from pebble.extensions.operator.client.control import ASKS_S, ControlClient, Rob
 from pebble.extensions.operator.client.pace_of_link import WIDE, pace_of
 from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.transports import Message
-from tests.ext.operator.client.control_robot import KeepingRobot
-from tests.ext.operator.client.estop_robot import capabilities
+from tests.ext.operator.client.estop_robot import KeepingRobot, capabilities
 from tests.support import cases
 
 GOOB = "pebble/robots/goob"

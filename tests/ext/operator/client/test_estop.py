@@ -321,8 +321,7 @@ CAPABILITIES = (
     "capabilities",
     {"t": 1, "value": {"drive": {"available": True}, "estop": {"available": True, "owners": ["serial"]}}},
 )
-LATCH = Robot(GOOB, "serial").owners[0].latch
-STATE = ("estop/serial", LATCH.state(True))
+STATE = ("estop/serial", Robot(GOOB, "serial").owners[0].latch.state(True))
 
 #: What strangers publish for each of their components, and then the real robot.
 CROWDS = [
@@ -333,8 +332,7 @@ CROWDS = [
 
 
 def publish(stop: StopSender, base: str, bodies: list[tuple[str, object]], now: float) -> list[Message]:
-    for metric, body in bodies:
-        receive(stop, outgoing(base, metric, body, retain=metric == "status"), now=now)
+    publish_quietly(stop, base, bodies, now)
     return stop.tick(now)
 
 

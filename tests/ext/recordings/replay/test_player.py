@@ -11,7 +11,7 @@ from pebble.extensions.media.packets import KEY_FRAME, Picture, PictureKind
 from pebble.extensions.recordings.replay.rules import Options, zero
 from pebble.extensions.recordings.replay.source import ReplaySource
 from pebble.extensions.recordings.stamps import stamp_ns
-from tests.ext.recordings.playing import GOOB, NOW_NS, THEN_NS, Line, Stage, js, ms, picture, write
+from tests.ext.recordings.playing import GOOB, NOW_NS, THEN_NS, Line, Stage, js, ms, write
 
 LOGS = f"{GOOB}/outgoing/logs"
 DRIVE = f"{GOOB}/incoming/drive-values"
@@ -92,7 +92,7 @@ def test_what_is_refused_is_sent_again_and_nothing_is_lost(walk: Path) -> None:
 
 def test_a_process_that_stood_still_sends_no_burst(walk: Path) -> None:
     stage = Stage(walk, ALL)
-    stage.at(10.5, lambda: stage.time.wait(3600)).run()
+    stage.at(10.5, lambda: setattr(stage, "seconds", 3610.5)).run()
     assert stage.sent[12].at - stage.sent[11].at == pytest.approx(1, abs=0.06)
 
 
@@ -182,9 +182,10 @@ def test_state_before_has_stamps_of_its_age(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kinds", [(PictureKind.JPEG, PictureKind.DELTA_JPEG), (PictureKind.H264, PictureKind.H264)])
 def test_a_seek_begins_at_a_key_frame(tmp_path: Path, kinds: tuple[PictureKind, PictureKind]) -> None:
     whole, delta = kinds
+    kinds_of = [(whole, KEY_FRAME), *[(delta, 0)] * 39] * 15
     lines = [
-        Line(n / 10, CAMERA, picture(*((whole, n, n / 10, KEY_FRAME) if n % 40 == 0 else (delta, n, n / 10))))
-        for n in range(600)
+        Line(n / 10, CAMERA, Picture(kind, n, ms(n / 10), b"picture", flags).pack())
+        for n, (kind, flags) in enumerate(kinds_of)
     ]
     stage = Stage(write(tmp_path / "x.mcap", lines), ALL)
     stage.at(2.05, lambda: stage.player.seek(THEN_NS + int(33.05 * 1e9))).run()
@@ -195,7 +196,7 @@ def test_a_seek_begins_at_a_key_frame(tmp_path: Path, kinds: tuple[PictureKind, 
 
 
 def test_a_key_frame_of_long_ago_is_of_no_use(tmp_path: Path) -> None:
-    lines = [Line(0, CAMERA, picture(PictureKind.JPEG, 0, 0)), Line(100, CAMERA, picture(PictureKind.JPEG, 1, 100))]
+    lines = [Line(at, CAMERA, Picture(PictureKind.JPEG, at, ms(at), b"picture").pack()) for at in (0, 100)]
     stage = Stage(write(tmp_path / "x.mcap", lines), ALL, since_ns=THEN_NS + 90 * 10**9).run()
     assert len(stage.sent) == 1
 

@@ -10,11 +10,15 @@ import pytest
 from pebble.contract import CHANNELS, INCOMING
 from pebble.errors import ConfigError, TransportError
 from pebble.extensions.recordings.files.recorded import Channel, Recorded
-from pebble.extensions.recordings.replay.rules import Options, Outgoing, ReplayError, zero
+from pebble.extensions.recordings.replay.rules import Options, Outgoing, ReplayError, Rules, zero
 from pebble.transports import QoS
-from tests.ext.recordings.playing import FRED, GOOB, THEN_NS, Line, js, ms, rules_of
+from tests.ext.recordings.playing import FRED, GOOB, THEN_NS, Line, js, ms
 
 EVERYTHING = Options(incoming=True)
+
+
+def rules_of(options: Options, *lines: Line) -> Rules:
+    return Rules(options, [Channel(number, line.topic, "json", line.metadata) for number, line in enumerate(lines)])
 
 
 def sent(options: Options, line: Line, *others: Line) -> Outgoing | None:

@@ -4,13 +4,24 @@ from __future__ import annotations
 
 import math
 import signal
+from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any
 
 import pytest
 
+from tests.ext.scripts.script.station import Station
 from tests.ext.scripts.shipped.stand_in import Sensors
 from tests.support import WAIT_S, until
+
+
+@pytest.fixture(scope="module", params=["zenoh", pytest.param("mqtt", marks=pytest.mark.thorough)])
+def sensors(request: pytest.FixtureRequest) -> Iterator[Sensors]:
+    station = Station(request.param)
+    sensors = Sensors(station)
+    yield sensors
+    sensors.close()
+    station.close()
 
 
 def end(script: Any) -> str:
