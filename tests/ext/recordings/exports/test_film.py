@@ -78,7 +78,7 @@ def in_order(*streams: list[Recorded]) -> list[Recorded]:
 class Film(NamedTuple):
     seconds: float
     shown: list[tuple[float, int | None, bool]]  # ms, number, whether it is the flash
-    samples: np.ndarray  # (samples, channels)
+    samples: np.ndarray  # each at its time: silence before the first one
     codecs: list[str]
     size: tuple[int, int]
 
@@ -88,7 +88,7 @@ class Film(NamedTuple):
 
     @property
     def click_ms(self) -> float:
-        return float(np.argmax(np.abs(self.samples[:, 0]) > 5000)) * 1000 / RATE
+        return float(np.argmax(np.abs(self.samples) > 5000)) * 1000 / RATE
 
 
 def opened(path: Path) -> Film:
@@ -99,12 +99,7 @@ def opened(path: Path) -> Film:
         for frame in film.decode(video):
             pixels = frame.to_ndarray(format="bgr24")
             shown.append((frame.time * 1000, read_counter(pixels), bool(pixels[: size[1] // 2].mean() > 200)))
-    return Film(seconds, shown, sound_of(path), codecs, size)
-
-
-def sound_of(path: Path) -> np.ndarray:
-    """The samples, each at its time: silence before the first one."""
-    with av.open(str(path)) as film:
+        film.seek(0)
         track, parts = film.streams.audio[:1], []
         resampler = av.AudioResampler("s16", "mono", RATE)
         for frame in film.decode(*track) if track else ():
@@ -112,7 +107,7 @@ def sound_of(path: Path) -> np.ndarray:
                 parts.append(np.zeros(max(0, round(frame.time * RATE)), np.int16))
             parts += [one.to_ndarray().reshape(-1) for one in resampler.resample(frame)]
         parts += [one.to_ndarray().reshape(-1) for one in resampler.resample(None)] if parts else []
-    return np.concatenate([*parts, np.zeros(0, np.int16)]).reshape(-1, 1)
+    return Film(seconds, shown, np.concatenate([*parts, np.zeros(0, np.int16)]), codecs, size)
 
 
 def check_numbers(film: Film) -> None:

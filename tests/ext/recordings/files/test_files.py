@@ -137,11 +137,10 @@ def lose_a_part(raw: bytearray, rng: random.Random) -> None:
     del raw[begin : begin + rng.randrange(60_000)]
 
 
-DAMAGES = [(flip, True), (zero_a_page, False), (end_in_zeros, False), (lose_a_part, True)]
-
-
 class TestDamaged:
-    @pytest.mark.parametrize(("damage", "finished"), DAMAGES)
+    @pytest.mark.parametrize(
+        ("damage", "finished"), [(flip, True), (zero_a_page, False), (end_in_zeros, False), (lose_a_part, True)]
+    )
     def test_all_that_is_left_is_read_mended_and_what_is_missing_is_known(
         self, tmp_path: Path, damage: Callable[[bytearray, random.Random], None], finished: bool
     ) -> None:

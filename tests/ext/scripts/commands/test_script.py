@@ -194,12 +194,9 @@ def test_it_is_a_script_of_less_than_30_lines(folder: Path) -> None:
     assert [entry["arg"] for entry in described["configs"]] == ["--tag-id", "--distance-m"]
 
 
-def test_its_robot_is_one(folder: Path, run: Run) -> None:
+def test_its_robot_is_one_and_its_folder_is_left_alone_the_next_time(folder: Path, run: Run) -> None:
     assert run("check", folder / "goob.json") == 0, run.err
     assert "autonomy_manager" in run.out
-
-
-def test_an_existing_folder_is_left_alone(folder: Path, run: Run) -> None:
     assert run("script", "new", "follow-me", "--folder", folder.parent) == 1
     assert run.err == f"pebble: {folder} exists already: choose another name, or another --folder\n"
 

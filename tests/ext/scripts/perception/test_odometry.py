@@ -67,7 +67,7 @@ class WheelsRig:
         self.now = 100.0
         self.mcu = SimulatedMcu("goob", self.now)
         self.motion = self.mcu.motion
-        self.start_mm = self.motion.left_mm, self.motion.right_mm = start_mm
+        self.motion.left_mm, self.motion.right_mm = start_mm
         self.odometry = Odometry(geometry or OdometrySettings(), self.now)
         self._gyro, self._noise, self._sign = gyro, noise, gyro_sign
         self._random = random.Random(1)
@@ -106,14 +106,6 @@ class WheelsRig:
         pose = self.motion.pose
         return math.hypot(self.odometry.pose.x_mm - pose.x_mm, self.odometry.pose.y_mm - pose.y_mm)
 
-    def error_deg(self) -> float:
-        off = self.odometry.pose.heading_rad - self.motion.pose.heading_rad
-        return math.degrees(abs(math.remainder(off, math.tau)))
-
-    def wheel_errors_mm(self) -> tuple[float, float]:
-        value, (left, right) = self.odometry.value(), self.start_mm
-        return value["left_mm"] - self.motion.left_mm + left, value["right_mm"] - self.motion.right_mm + right
-
     def _take(self, output: bytes) -> None:
         found, self._received = touches(self._received + output, lambda: self._random.gauss(0.0, self._noise))
         for values in found:
@@ -142,7 +134,8 @@ def test_a_square_ends_where_it_began(side: int, gyro: bool) -> None:
         rig.drive(math.pi / 4 * TRACK_MM / FULL_SPEED_MM_S / 0.3, x=-side * 0.3)
         rig.stop()
     assert rig.error_mm() < 25
-    assert rig.error_deg() < 1.5
+    off = rig.odometry.pose.heading_rad - rig.motion.pose.heading_rad
+    assert abs(math.remainder(off, math.tau)) < math.radians(1.5)
     assert rig.odometry.value().get("heading_source") == {True: "gyro", False: None}[gyro]
 
 
@@ -153,9 +146,9 @@ def test_reversals_without_a_stop_lose_no_step() -> None:
     for _ in range(20):
         rig.drive(chosen.uniform(0.2, 2.0), x=chosen.uniform(-1, 1), z=chosen.uniform(-1, 1))
     rig.stop()
-    left, right = rig.wheel_errors_mm()
-    assert abs(left) < 2, "its second sensor shows the direction"
-    assert abs(right) < 10
+    value = rig.odometry.value()
+    assert value["left_mm"] == pytest.approx(rig.motion.left_mm, abs=2), "its second sensor shows the direction"
+    assert value["right_mm"] == pytest.approx(rig.motion.right_mm, abs=10)
 
 
 def test_all_fields_of_the_payload() -> None:

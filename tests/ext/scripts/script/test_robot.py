@@ -128,10 +128,7 @@ def test_a_last_value_that_fails_keeps_nothing_from_ending(setting: Setting, cap
     assert "publish_at_end: no last mood" in caplog.text
 
 
-@pytest.mark.parametrize(
-    ("x", "error"),
-    [("left", ValueError), (None, TypeError), (math.nan, ValueError)],
-)
+@pytest.mark.parametrize(("x", "error"), [("left", ValueError), (None, TypeError), (math.nan, ValueError)])
 def test_what_is_no_number_is_named_and_drives_nothing(setting: Setting, x: Any, error: type[Exception]) -> None:
     for axis in ("x", "z"):
         with pytest.raises(error, match=rf"{axis} is (a number from -1 to 1, not |not a finite)"):
