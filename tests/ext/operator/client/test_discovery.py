@@ -38,8 +38,8 @@ def link(level: LinkLevel, hz: float, queue_ms: int = 40) -> LinkState:
     return LinkState(level=level, drive_hz=hz, rtt_ms=310, queue_ms=queue_ms, t=1)
 
 
-def publish_heartbeats(discovery: Discovery, *times: float) -> RobotView:
-    for now in times:
+def publish_heartbeats(discovery: Discovery) -> RobotView:
+    for now in (0.0, 0.25, 0.5):
         publish(discovery, "online", {"t": int((WALL + now - 0.01) * 1000)}, now=now)
     return discovery.robots[BASE]
 
@@ -85,7 +85,7 @@ def test_strangers_fill_no_memory_and_keep_no_capabilities_out() -> None:
 
 def test_topics_of_another_robot_in_capabilities_are_not_used() -> None:
     discovery = Discovery()
-    seen = publish_heartbeats(discovery, 0.0, 0.25, 0.5)
+    seen = publish_heartbeats(discovery)
     drive, lights = "pebble/robots/another/incoming/drive-values", "pebble/robots/another/incoming/lights-solid"
     value = {"drive": {"available": True, "topic": drive}, "lights": {"solid_topic": lights}}
     publish(
@@ -112,7 +112,7 @@ def test_only_what_a_robot_offers_is_assumed_of_it(drive: dict[str, object], dri
     publish(discovery, "charging-level", {"value": 7.4})
     publish(discovery, "capabilities", "nonsense")
     publish(discovery, "autonomy-status", "nonsense")
-    seen = publish_heartbeats(discovery, 0.0, 0.25, 0.5).situation(1.9)
+    seen = publish_heartbeats(discovery).situation(1.9)
     assert (seen.drives, seen.arbitrates, seen.script, seen.online) == (drives, arbitrates, True, True)
     robot = discovery.robots[BASE]
     assert (robot.transport, robot.volts, discovery.traffic[BASE].count) == ("zenoh", 7.4, 8)

@@ -75,14 +75,12 @@ def everything(folder: Path) -> list[Recorded]:
     return list(merged(files([folder])))
 
 
-def moments(count: int = 25) -> list[int]:
-    """Nanoseconds, at random and at messages."""
-    chance = random.Random(7)
-    return [THEN_NS + round(1e9 * chance.uniform(0.5, SECONDS)) for _ in range(count)] + [THEN_NS + 12 * 10**9]
-
-
 def at_ns(seconds: float) -> int:
     return THEN_NS + round(seconds * 1e9)
+
+
+#: At random and at messages.
+MOMENTS = [*(at_ns(random.Random(seed).uniform(0.5, SECONDS)) for seed in range(25)), at_ns(12)]
 
 
 def texts(messages: list[Recorded]) -> list[tuple[int, str, bytes]]:
@@ -90,7 +88,7 @@ def texts(messages: list[Recorded]) -> list[tuple[int, str, bytes]]:
 
 
 def test_a_period_holds_exactly_its_messages(archive: Archive, everything: list[Recorded]) -> None:
-    for begin in moments():
+    for begin in MOMENTS:
         end = begin + 2 * 10**9
         wanted = [one for one in everything if begin <= one.log_ns < end]
         assert sorted(texts(archive.messages(GOOB, begin, end))) == sorted(texts(wanted))
@@ -98,7 +96,7 @@ def test_a_period_holds_exactly_its_messages(archive: Archive, everything: list[
 
 
 def test_the_state_is_the_newest_value_of_each_topic(archive: Archive, everything: list[Recorded]) -> None:
-    for at in moments():
+    for at in MOMENTS:
         newest = {
             one.channel.topic: one
             for one in everything
