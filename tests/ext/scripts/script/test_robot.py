@@ -38,8 +38,8 @@ class Setting:
         )
         self.robot = Robot(config, transport, lambda above: above + 1, clock=lambda: self.now, **options)
 
-    def send(self, value: WheelOdometry, *, retain: bool = False) -> None:
-        self.other.publish(WHEEL_ODOMETRY.topic(BASE), codec.encode(WHEEL_ODOMETRY, value), retain=retain)
+    def send(self, value: WheelOdometry) -> None:
+        self.other.publish(WHEEL_ODOMETRY.topic(BASE), codec.encode(WHEEL_ODOMETRY, value))
 
     def close(self) -> None:
         self.robot.close()
