@@ -15,7 +15,7 @@ from pebble.contract.names import without_name
 from pebble.contract.payloads import Heartbeat
 from pebble.transports import Message, MqttSettings, QoS, create
 from tests.ext.operator.client import estop_robot
-from tests.ext.operator.client.control_robot import KeepingRobot
+from tests.ext.operator.client.estop_robot import KeepingRobot
 
 HEARTBEAT_S = 0.25
 

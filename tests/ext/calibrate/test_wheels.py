@@ -23,9 +23,9 @@ from pebble.extensions.calibrate.wheels import Wanted, calibrate, check
 from pebble.extensions.lab.simulation.motion import FULL_SPEED_MM_S, Wheels
 from pebble.extensions.lab.simulation.world.script_robot import SimulatedRobot
 from pebble.extensions.scripts.perception.tags import Place, Tag
-from tests.ext.scripts.perception.wheels_rig import powers, touches, turning
+from tests.ext.scripts.perception.test_odometry import powers, touches, turning
 from tests.ext.scripts.script.station import Station
-from tests.ext.scripts.shipped.stand_in import Sensors
+from tests.ext.scripts.shipped.test_processes import Sensors
 from tests.support import WAIT_S, Child, cases, some, until
 
 TRUE = Wheels(61.0 * 1.01, 61.0 * 0.99, 130.5 * 1.03)

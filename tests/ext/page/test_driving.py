@@ -21,7 +21,7 @@ from pebble.extensions.page.drive.driven_robot import TABLE, Event, State, Tab
 from pebble.extensions.page.drive.drivers import MOST_WISHES, Drivers
 from pebble.extensions.page.messages import DriveOp, DriverView
 from pebble.transports import Message, QoS
-from tests.ext.operator.client.control_robot import KeepingRobot
+from tests.ext.operator.client.estop_robot import KeepingRobot
 
 GOOB, FRED = "pebble/robots/goob", "pebble/robots/fred"
 STEP_S = 0.05

@@ -28,7 +28,7 @@ from pebble.extensions.recordings.traffic.index import index_path
 from tests.ext.page import failing_jobs
 from tests.ext.page.served import Served
 from tests.ext.recordings.playing import GOOB, Line, js, ms, write
-from tests.ext.recordings.seek.filming import FPS, SCENES, film
+from tests.ext.recordings.seek.test_archive import FPS, SCENES, film
 from tests.kit.scene import read_counter
 from tests.support import Broker, gone, until
 

@@ -1,9 +1,12 @@
-"""Recordings made by the writer itself, for tests of what reads them."""
+"""Recordings for tests of what reads them: those that the writer makes here, and two of the demo's robots.
+
+``DRIVE``: four robots that are driven and stopped, from their start on, without pictures and sound.
+``MEDIA``: Fred's pictures in json, pbvd, pbvz and h264, and its sound in PCM and Opus, a part of each.
+"""
 
 from __future__ import annotations
 
 import random
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +16,7 @@ from pebble.extensions.recordings.files.writer import RecordingWriter
 
 START_NS = 1_790_000_000_000_000_000
 STEP_NS = 10_000_000
+DRIVE, MEDIA = (Path(__file__).parents[2] / "data" / "recordings" / f"{name}.mcap" for name in ("drive", "media"))
 
 
 def write(
@@ -45,9 +49,3 @@ def read(path: Path, **options: Any) -> tuple[list[tuple[str, bytes]], Damage]:
     """Topics and payloads of what can be read, and what cannot."""
     with RecordingFile(path) as file:
         return [(message.channel.topic, message.payload) for message in file.read(**options)], file.damage
-
-
-def is_part_of(some: Iterable[Any], whole: Iterable[Any]) -> bool:
-    """Whether ``some`` are in ``whole``, in its order."""
-    rest = iter(whole)
-    return all(one in rest for one in some)

@@ -8,8 +8,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pebble.extensions.media.packets import Codec, Picture, PictureKind, Sound
-from pebble.extensions.recordings.files.recorded import Channel
+from pebble.extensions.media.packets import Codec, Sound
 from pebble.extensions.recordings.files.writer import RecordingWriter
 from pebble.extensions.recordings.replay.player import BusOutput, Player
 from pebble.extensions.recordings.replay.rules import Options, Rules
@@ -53,6 +52,7 @@ def ms(at: float) -> int:
 
 def write(path: Path, lines: Iterable[Any], *, finished: bool = True, chunk_ns: int = 1 << 63) -> Path:
     """A recording of these lines, in chunks of this length."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("wb", buffering=0) as file:
         writer = RecordingWriter(file, library="pebble test")
         numbers: dict[tuple[str, str], int] = {}
@@ -71,22 +71,6 @@ def write(path: Path, lines: Iterable[Any], *, finished: bool = True, chunk_ns: 
     return path
 
 
-class VirtualTime:
-    """A clock that only waiting moves on."""
-
-    def __init__(self) -> None:
-        self.seconds = 0.0
-
-    def now(self) -> float:
-        return self.seconds
-
-    def wall_ns(self) -> int:
-        return NOW_NS + round(self.seconds * 1e9)
-
-    def wait(self, seconds: float) -> None:
-        self.seconds += seconds
-
-
 class Sent(NamedTuple):
     at: float
     message: Message
@@ -96,7 +80,7 @@ class Stage:
     """A player in virtual time, and all that it publishes."""
 
     def __init__(self, path: Path | Sequence[Path], options: Options | None = None, **playing: Any) -> None:
-        self.time = VirtualTime()
+        self.seconds = 0.0  # which only waiting moves on
         self.sent: list[Sent] = []
         self.refuses = 0  # so many of the next messages
         self.takes_s = 0.0  # for each message
@@ -104,8 +88,8 @@ class Stage:
         self.actions: list[tuple[float, Any]] = []  # what to do at a time, in order
         source = ReplaySource([path] if isinstance(path, Path) else path)
         self.rules = Rules(options or Options(), source.channels)
-        output = BusOutput(self.rules, self._publish, self.time.wall_ns)
-        clocks = {"now": self.time.now, "wait": self._wait}
+        output = BusOutput(self.rules, self._publish, lambda: NOW_NS + round(self.seconds * 1e9))
+        clocks = {"now": lambda: self.seconds, "wait": self._wait}
         self.player = Player(source, self.rules.publishes, output, **clocks, **playing)
 
     def run(self) -> Stage:
@@ -116,10 +100,6 @@ class Stage:
         self.actions.append((seconds, action))
         return self
 
-    @property
-    def topics(self) -> list[str]:
-        return [sent.message.topic for sent in self.sent]
-
     def payloads(self, topic: str) -> list[bytes]:
         return [sent.message.payload for sent in self.sent if sent.message.topic == topic]
 
@@ -127,23 +107,15 @@ class Stage:
         if self.refuses:
             self.refuses -= 1
             return False
-        self.time.wait(self.takes_s)
-        self.sent.append(Sent(self.time.now(), message))
+        self.seconds += self.takes_s
+        self.sent.append(Sent(self.seconds, message))
         return True
 
     def _wait(self, seconds: float) -> None:
         self.waits += 1
-        self.time.wait(seconds)
-        while self.actions and self.time.now() >= self.actions[0][0]:
+        self.seconds += seconds
+        while self.actions and self.seconds >= self.actions[0][0]:
             self.actions.pop(0)[1]()
-
-
-def rules_of(options: Options, *lines: Line) -> Rules:
-    return Rules(options, [Channel(number, line.topic, "json", line.metadata) for number, line in enumerate(lines)])
-
-
-def picture(kind: PictureKind, frame: int, at: float, flags: int = 0, body: bytes = b"picture") -> bytes:
-    return Picture(kind, frame, ms(at), body, flags).pack()
 
 
 def demo(seconds: float, robots: Sequence[str] = (GOOB, FRED)) -> Iterator[Line]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import io
-import os
 import random
 import signal
 import subprocess
@@ -31,15 +30,11 @@ from pebble.extensions.recordings.seek.days import Days
 from pebble.extensions.recordings.traffic.sources import sources
 from tests.commands.command_line import Run
 from tests.ext.recordings.messages import START_NS, STEP_NS, contents, read, write
-from tests.support import cases
+from tests.support import cases, refused
 
 GOOB, FRED = "pebble/robots/goob/outgoing/online", "pebble/robots/fred/outgoing/online"
 COUNT: Final = 40
 SCHEMA: Final = ("Online", "jsonschema", b'{"type": "object"}')
-ORDERS: Final[dict[str, list[int]]] = {
-    "forward": list(range(COUNT)),
-    "interleaved": [*range(0, COUNT, 2), *range(1, COUNT, 2)],
-}
 NONE, LZ4, ZSTD = CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD
 
 
@@ -48,7 +43,7 @@ def payload(number: int) -> bytes:
 
 
 def by_package(
-    *, order: str = "forward", beside: bool = False,
+    *, interleaved: bool = False, beside: bool = False,
     sequence: Callable[[int], int] = lambda number: number, library: str = "other",
     **options: Any,
 ) -> bytes:  # fmt: skip
@@ -62,7 +57,7 @@ def by_package(
         writer.add_attachment(1, 2, "plan.txt", "text/plain", b"walls")
     number = writer.register_schema(*SCHEMA)
     goob, fred = (writer.register_channel(topic, "json", number) for topic in (GOOB, FRED))
-    for one in ORDERS[order]:
+    for one in [*range(0, COUNT, 2), *range(1, COUNT, 2)] if interleaved else range(COUNT):
         writer.add_message(fred if one % 4 == 3 else goob, START_NS + one * STEP_NS, payload(one), 0, sequence(one))
     writer.finish()
     return out.getvalue()
@@ -72,8 +67,8 @@ def by_package(
 VALID: Final[dict[str, bytes]] = {
     "zstd": by_package(compression=ZSTD),
     "lz4": by_package(compression=LZ4),
-    "chunks overlap": by_package(order="interleaved"),
-    "one chunk in another order": by_package(order="interleaved", chunk_size=1 << 20),
+    "chunks overlap": by_package(interleaved=True),
+    "one chunk in another order": by_package(interleaved=True, chunk_size=1 << 20),
     "a library like ours": by_package(library="pebble rosbag2-recorder", sequence=lambda number: 1000 - number),
     "metadata and attachments": by_package(beside=True),
 }
@@ -113,7 +108,6 @@ DAMAGED: Final[dict[str, tuple[bytes, str]]] = {
 
 
 EXPECTED = [(FRED if number % 4 == 3 else GOOB, payload(number)) for number in range(COUNT)]
-OF_GOOB = [one for one in EXPECTED if one[0] == GOOB]
 pytest.importorskip("duckdb")
 pytest.importorskip("matplotlib")
 NAME = "20261122T100030Z-000001.state.mcap"
@@ -135,7 +129,7 @@ def test_a_file_of_another_program_is_read_in_the_order_of_time(tmp_path: Path, 
     assert exported(copy) == [(*SCHEMA, *one) for one in EXPECTED]
     archive = Archive(tmp_path / "rec")
     shown = archive.messages("pebble/robots/goob", 0, 1 << 63)
-    assert [(one.channel.topic, one.payload) for one in shown] == OF_GOOB
+    assert [(one.channel.topic, one.payload) for one in shown] == [one for one in EXPECTED if one[0] == GOOB]
     assert archive.unread() == {}
     archive.close()
     replayed = ReplaySource([path])
@@ -175,8 +169,6 @@ READERS = [
     ["list"], ["info"], ["search"], ["export", "{out}.jsonl"], ["export", "{out}.mcap"],
     ["export", "{out}.wav", "-r", "goob"], ["analyse", "--output", "{out}"],
 ]  # fmt: skip
-#: What is found out by reading messages only: a summary says nothing of it.
-IN_CHUNKS = {"a chunk", "the kind of a chunk"}
 WRITERS = [["rm", "--robot", "fred", "--yes"], ["rm", "--since", "2000-01-01", "--yes"]]
 
 
@@ -185,19 +177,16 @@ def on(folder: Path, command: list[str], out: Path) -> list[str | Path]:
     return [*group, command[0], folder, *(one.replace("{out}", str(out)) for one in command[1:])]
 
 
-@pytest.fixture
-def _no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reports without them, which take longest."""
-    monkeypatch.setattr("pebble.extensions.recordings.traffic.report.figures", lambda _: [])
-
-
-@pytest.mark.usefixtures("_no_figures")
 @pytest.mark.parametrize("name", DAMAGED)
-def test_what_cannot_be_read_is_named_and_not_touched(tmp_path: Path, run: Run, name: str) -> None:
+def test_what_cannot_be_read_is_named_and_not_touched(
+    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.setattr("pebble.extensions.recordings.traffic.report.figures", lambda _: [])  # which take longest
     data, wanted = DAMAGED[name]
     path = stored(tmp_path, data)
     unread = [line for day in Days(Archive(tmp_path / "rec")).all() for line in day.unread]
-    assert any(wanted in line for line in unread) == (name not in IN_CHUNKS)
+    only_in_messages = name in ("a chunk", "the kind of a chunk")  # a summary says nothing of it
+    assert any(wanted in line for line in unread) != only_in_messages
     each = cases(4, 1)  # of the commands, for a damage others than for the next one
     for number, command in enumerate([*READERS, *WRITERS][[*DAMAGED].index(name) % each :: each]):
         code = run(*on(tmp_path / "rec", command, tmp_path / str(number)))
@@ -212,7 +201,7 @@ def test_a_flipped_bit_anywhere_costs_no_message_at_a_deletion(tmp_path: Path) -
     write(path, 60, channels=2, each=20)
     data, chance = path.read_bytes(), random.Random(1)
     expected = [one for one in contents(path) if "/r0/" not in one[0]]
-    refused = 0
+    left = 0
     for at in range(chance.randrange(7), len(data), cases(41, 7)):
         raw = flipped(data, at, chance.randrange(8))
         path.write_bytes(raw)
@@ -220,10 +209,10 @@ def test_a_flipped_bit_anywhere_costs_no_message_at_a_deletion(tmp_path: Path) -
             rewrite(path, path, keeps=lambda one: "/r0/" not in one.channel.topic)
         except RecordingError:
             assert path.read_bytes() == raw
-            refused += 1
+            left += 1
         else:
             assert contents(path) == expected, at
-    assert refused > 8
+    assert left > 8
 
 
 def test_without_the_package_the_extra_is_named(tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -232,10 +221,6 @@ def test_without_the_package_the_extra_is_named(tmp_path: Path, run: Run, monkey
     assert run(*on(tmp_path / "rec", WRITERS[0], tmp_path / "out")) == 1
     assert 'recordings need the package mcap: pip install "pebble-robot[record]"' in run.err
     assert path.read_bytes() == by_package()
-
-
-def _full(_descriptor: int) -> None:
-    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 class TestInterrupted:
@@ -250,7 +235,7 @@ class TestInterrupted:
     @pytest.mark.parametrize(
         ("fails", "problem"),
         [
-            ((rewriting.os, "fsync", _full), "No space left on device"),
+            ((rewriting.os, "fsync", refused(errno.ENOSPC)), "No space left on device"),
             ((RecordingWriter, "finish", lambda _writer: None), "cannot be read again"),
             ((rewriting.shutil, "disk_usage", lambda _folder: SimpleNamespace(free=1000)), "there is no room"),
         ],

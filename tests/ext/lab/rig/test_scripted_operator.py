@@ -13,8 +13,7 @@ from pebble.contract.payloads import Drive
 from pebble.extensions.lab.rig.scripted_operator import VALID_MS, ScriptedOperator
 from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.transports import Message, QoS
-from tests.ext.operator.client.control_robot import KeepingRobot
-from tests.ext.operator.client.estop_robot import Robot, capabilities
+from tests.ext.operator.client.estop_robot import KeepingRobot, Robot, capabilities
 
 BASE = "pebble/robots/mine"
 DRIVE = f"{BASE}/incoming/drive-values"

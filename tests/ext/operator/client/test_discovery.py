@@ -1,19 +1,28 @@
-"""Discovery of robots by what they publish to a broker."""
+"""Discovery of robots by what they publish to a broker, and at what pace commands go over their links."""
 
 from __future__ import annotations
 
 import json
+import math
 from itertools import chain
 from typing import Any
 
+import msgspec
 import pytest
+from msgspec import UNSET
 
 from pebble import contract as c
-from pebble.contract import CAPABILITIES, DRIVE, ESTOP_STATE, LINK
+from pebble.contract import CAPABILITIES, DRIVE, ESTOP_STATE, LINK, ONLINE
+from pebble.contract.levels import LEVELS, silent_after
+from pebble.contract.payloads import Drive, LinkLevel, LinkState
 from pebble.extensions.operator.client.announced import announced
 from pebble.extensions.operator.client.discovery import Discovery
+from pebble.extensions.operator.client.estop import COLLECT_S, StopSender, new_name
+from pebble.extensions.operator.client.pace_of_link import WIDE, Pace, pace_of
 from pebble.extensions.operator.client.robot_view import MAX_REMEMBERED, RobotView
-from pebble.transports import Message
+from pebble.extensions.operator.client.stamps import stamp_of
+from pebble.transports import Message, QoS
+from tests.ext.operator.client.estop_robot import outgoing
 from tests.support import ROOT
 
 BASE = "pebble/robots/goob"
@@ -22,18 +31,15 @@ LIVENESS = json.loads((ROOT / "tests" / "vectors" / "liveness.json").read_text()
 
 
 def publish(discovery: Discovery, metric: str, body: object, *, now: float = 0.0, retain: bool = False) -> None:
-    message = Message(f"{BASE}/outgoing/{metric}", json.dumps(body).encode(), retain=retain)
-    discovery.receive(message, now, WALL + now)
+    discovery.receive(outgoing(BASE, metric, body, retain=retain), now, WALL + now)
 
 
-def link(level: str | None) -> bytes:
-    """What a robot publishes of its link; None: it removes that."""
-    body = {"level": level, "drive_hz": 4, "rtt_ms": 600, "queue_ms": 0, "t": 1}
-    return b"" if level is None else json.dumps(body).encode()
+def link(level: LinkLevel, hz: float, queue_ms: int = 40) -> LinkState:
+    return LinkState(level=level, drive_hz=hz, rtt_ms=310, queue_ms=queue_ms, t=1)
 
 
-def publish_heartbeats(discovery: Discovery, *times: float) -> RobotView:
-    for now in times:
+def publish_heartbeats(discovery: Discovery) -> RobotView:
+    for now in (0.0, 0.25, 0.5):
         publish(discovery, "online", {"t": int((WALL + now - 0.01) * 1000)}, now=now)
     return discovery.robots[BASE]
 
@@ -56,7 +62,8 @@ def test_a_server_is_no_robot() -> None:
 def test_what_heartbeats_show(row: dict[str, Any]) -> None:
     robot = RobotView(BASE)
     for level in row.get("link", ()):
-        robot.receive(LINK, Message(LINK.topic(BASE), link(level)), 0.0, 0.0)
+        state = b"" if level is None else msgspec.json.encode(link(level, 4))
+        robot.receive(LINK, Message(LINK.topic(BASE), state), 0.0, 0.0)
     liveness = robot.liveness
     for at, late_s in row["heartbeats"]:
         liveness.heartbeat(at, late_s)
@@ -78,7 +85,7 @@ def test_strangers_fill_no_memory_and_keep_no_capabilities_out() -> None:
 
 def test_topics_of_another_robot_in_capabilities_are_not_used() -> None:
     discovery = Discovery()
-    seen = publish_heartbeats(discovery, 0.0, 0.25, 0.5)
+    seen = publish_heartbeats(discovery)
     drive, lights = "pebble/robots/another/incoming/drive-values", "pebble/robots/another/incoming/lights-solid"
     value = {"drive": {"available": True, "topic": drive}, "lights": {"solid_topic": lights}}
     publish(
@@ -105,7 +112,7 @@ def test_only_what_a_robot_offers_is_assumed_of_it(drive: dict[str, object], dri
     publish(discovery, "charging-level", {"value": 7.4})
     publish(discovery, "capabilities", "nonsense")
     publish(discovery, "autonomy-status", "nonsense")
-    seen = publish_heartbeats(discovery, 0.0, 0.25, 0.5).situation(1.9)
+    seen = publish_heartbeats(discovery).situation(1.9)
     assert (seen.drives, seen.arbitrates, seen.script, seen.online) == (drives, arbitrates, True, True)
     robot = discovery.robots[BASE]
     assert (robot.transport, robot.volts, discovery.traffic[BASE].count) == ("zenoh", 7.4, 8)
@@ -147,7 +154,7 @@ def test_all_else_announces_nothing(made: bytes) -> None:
     assert announced(BASE, made) == {}
 
 
-@pytest.mark.parametrize(("channel", "key"), [(c.ONLINE, "subscribes"), (c.STATUS, "value")])
+@pytest.mark.parametrize(("channel", "key"), [(ONLINE, "subscribes"), (c.STATUS, "value")])
 def test_it_is_driven_until_it_publishes_capabilities(channel: c.Channel, key: str) -> None:
     robot = RobotView(BASE)
     made = payload(**{key: LIST if key == "subscribes" else {"subscribes": LIST}})
@@ -155,7 +162,111 @@ def test_it_is_driven_until_it_publishes_capabilities(channel: c.Channel, key: s
     assert robot.drives
     assert robot.topic(DRIVE) == f"{BASE}/incoming/drive-values"
     assert not robot.estop.has_capabilities
-    capable = Message(c.CAPABILITIES.topic(BASE), payload(value={"drive": {"available": False}}))
-    robot.receive(c.CAPABILITIES, capable, now=1.1, wall=1710969600.1)
+    capable = Message(CAPABILITIES.topic(BASE), payload(value={"drive": {"available": False}}))
+    robot.receive(CAPABILITIES, capable, now=1.1, wall=1710969600.1)
     robot.receive(channel, Message(channel.topic(BASE), made), now=1.2, wall=1710969600.2)
     assert not robot.drives
+
+
+# -- the pace of a link
+
+
+MOVE = Drive(z=0.5, valid_ms=400)
+
+
+@pytest.mark.parametrize(
+    ("state", "step_s", "qos", "valid_ms"),
+    [
+        (None, 0.015, QoS.DELIVERED, 400),
+        (link("narrow", 10), 0.075, QoS.LATEST, 400),
+        (link("thin", 4), 0.225, QoS.LATEST, 750),
+        # What a robot reports neither halts it between two commands, nor fills its link.
+        (link("narrow", 0), 0.175, QoS.LATEST, 400),
+        (link("thin", -7), 0.35, QoS.LATEST, 750),
+        (link("thin", 1e9), 0.025, QoS.LATEST, 750),
+        # Behind a queue that stays nothing comes in time.
+        (link("thin", 2.5, 500), 0.35, QoS.LATEST, 750),
+        (link("thin", 2.67, 60_000), 2.0, QoS.LATEST, 750),
+        (link("thin", 4, 1700), 0.225, QoS.LATEST, 750),  # it may have been a loss
+    ],
+)
+def test_a_robot_asks_for_a_pace(state: LinkState | None, step_s: float, qos: QoS, valid_ms: int) -> None:
+    pace = pace_of(state)
+    assert pace._replace(step_s=round(pace.step_s, 6))[:3] == (step_s, qos, valid_ms)
+    assert pace.stamped is (qos is QoS.LATEST)
+
+
+@pytest.mark.parametrize(
+    ("pace", "drive", "expected"),
+    [
+        (WIDE, MOVE, {}),
+        (Pace(stamped=True), MOVE, {"t": 12_346, "key": "0badf00d"}),
+        (Pace(stamped=True), msgspec.structs.replace(MOVE, key="aa bb"), {"t": 12_346, "key": "aa bb"}),
+    ],
+)
+def test_a_stamped_command_has_a_time_and_a_key(pace: Pace, drive: Drive, expected: dict[str, object]) -> None:
+    dated = pace.dated(drive, 12.3456, "0badf00d")
+    assert {"t": dated.t, "key": dated.key} == {"t": UNSET, "key": UNSET, **expected}
+
+
+def test_who_drives_keeps_to_the_pace_of_a_link_that_is_lost_for_a_while() -> None:
+    """More would wait at the broker for the robot's return."""
+    robot = RobotView(BASE)
+    robot.receive(LINK, outgoing(BASE, "link", msgspec.to_builtins(link("thin", 4)), retain=True), 1.0, 1.0)
+    assert robot.pace.valid_ms == 750
+    for online in (False, True):
+        robot.receive(ONLINE, outgoing(BASE, "online", {"t": 1, "online": online}), 2.0, 2.0)
+        assert robot.pace.valid_ms == 750
+    robot.receive(LINK, outgoing(BASE, "link", 7), 3.0, 3.0)
+    assert robot.pace is WIDE
+
+
+# -- who waits how long for a robot's silence, or for its answer
+
+
+def test_a_stop_of_all_waits_for_silent_robots_as_on_the_thinnest_link() -> None:
+    stop = StopSender(new_name(), by="ann", why="", now=0.0, robots=None)
+    stop.receive(outgoing(BASE, "online", {"t": 1}), COLLECT_S - 0.1)
+    assert list(stop.robots) == [BASE]
+    assert max(silent_after(link=level) for level in LEVELS) == COLLECT_S
+
+
+@pytest.mark.parametrize(("level", "limit_s"), {"wide": 2, "narrow": 3, "thin": 5}.items())
+def test_a_robot_whose_link_is_known_is_awaited_for(level: LinkLevel, limit_s: float) -> None:
+    discovery = Discovery()
+    publish(discovery, "link", msgspec.to_builtins(link(level, 4)), retain=True)
+    assert [discovery.awaits_heartbeat(limit_s + more_s) for more_s in (-0.1, 0.1)] == [True, False]
+    assert limit_s == silent_after(link=level)
+
+
+def test_a_first_robot_is_awaited_as_one_of_which_nothing_is_known() -> None:
+    assert [Discovery().awaits_heartbeat(after_s) for after_s in (1.9, 2.1)] == [True, False]
+    discovery = Discovery()
+    publish(discovery, "link", msgspec.to_builtins(link("thin", 4)), retain=True)
+    publish(discovery, "online", {"t": 1}, now=1.0)
+    assert not discovery.awaits_heartbeat(1.0)
+
+
+# -- time stamps in payloads
+
+
+@pytest.mark.parametrize(
+    ("plain", "seconds"),
+    [
+        ({"t": 1710969600123}, 1710969600.123),
+        ({"timestamp": 1710969600.5}, 1710969600.5),
+        ({"timestamp": 1710969600123}, 1710969600.123),
+        ({"t": 1710969600}, 1710969600.0),
+        ({"t": 1710969600123, "timestamp": 1.5e9}, 1710969600.123),
+        ({"t": 12345}, None),
+        ({"t": "1710969600123"}, None),
+        ({"t": math.nan}, None),
+        ({"t": 10**400}, None),
+        ({"t": -(10**400)}, None),
+        ({"t": math.inf}, None),
+        ({}, None),
+        ([1710969600123], None),
+    ],
+)
+def test_a_stamp_is_milliseconds_or_seconds_by_its_size(plain: Any, seconds: float | None) -> None:
+    assert stamp_of(plain) == seconds

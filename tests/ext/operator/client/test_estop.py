@@ -321,35 +321,27 @@ CAPABILITIES = (
     "capabilities",
     {"t": 1, "value": {"drive": {"available": True}, "estop": {"available": True, "owners": ["serial"]}}},
 )
-LATCH = Robot(GOOB, "serial").owners[0].latch
-STATE = ("estop/serial", LATCH.state(True))
-
-#: What strangers publish for each of their components, and then the real robot.
-CROWDS = [
-    ([HEARTBEAT], [HEARTBEAT]),
-    ([RETAINED], [RETAINED]),
-    ([STATE, CAPABILITIES, HEARTBEAT], [STATE, CAPABILITIES, HEARTBEAT]),
-]
+STATE = ("estop/serial", Robot(GOOB, "serial").owners[0].latch.state(True))
 
 
 def publish(stop: StopSender, base: str, bodies: list[tuple[str, object]], now: float) -> list[Message]:
-    for metric, body in bodies:
-        receive(stop, outgoing(base, metric, body, retain=metric == "status"), now=now)
+    publish_quietly(stop, base, bodies, now)
     return stop.tick(now)
 
 
 @pytest.mark.parametrize("hold", [False, True])
-@pytest.mark.parametrize(("theirs", "own"), CROWDS)
+@pytest.mark.parametrize("published", [[HEARTBEAT], [RETAINED], [STATE, CAPABILITIES, HEARTBEAT]])
 def test_a_crowd_of_strangers_keeps_the_stop_from_no_robot(
-    monkeypatch: pytest.MonkeyPatch, theirs: list[tuple[str, object]], own: list[tuple[str, object]], *, hold: bool
+    monkeypatch: pytest.MonkeyPatch, published: list[tuple[str, object]], *, hold: bool
 ) -> None:
+    """They publish for each of their components what the real robot publishes after them."""
     places, stop, sent = 30, sender(hold=hold), []
     monkeypatch.setattr(estop, "MAX_ROBOTS", places)
     for step in range(20):
         now = 0.25 * step
         for number in range(places + 6):
-            publish_quietly(stop, f"pebble/robots/r{number}", theirs, now)
-        messages = stop.tick(now) + publish(stop, GOOB, own, now)
+            publish_quietly(stop, f"pebble/robots/r{number}", published, now)
+        messages = stop.tick(now) + publish(stop, GOOB, published, now)
         sent += [now] * (ESTOP in topics(messages))
     assert sent[0] == 0.0
     assert max(later - earlier for earlier, later in pairwise([*sent, 5.0])) <= 0.5

@@ -32,17 +32,14 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def environment(folder: Path) -> dict[str, str]:
-    return {**os.environ, "PATH": f"{folder / 'bin'}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
-
-
 def bash(folder: Path, line: str) -> list[str]:
     """What a bash offers for the last word of a line."""
     words = line.split(" ")
     asked = f"COMP_WORDS=({shlex.join(words)}); COMP_CWORD={len(words) - 1}; _pebble_completion pebble"
     script = f'source {BASH}; {asked}; printf "%s\\n" "${{COMPREPLY[@]}}"'
     command = ["bash", "--norc", "-c", script]
-    done = subprocess.run(command, cwd=folder, env=environment(folder), capture_output=True, text=True, timeout=60)
+    env = {**os.environ, "PATH": f"{folder / 'bin'}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, timeout=60)
     assert done.stderr == ""
     return done.stdout.split()
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import pytest
 
@@ -41,8 +41,8 @@ def robot_on(broker: Broker) -> Iterator[Make]:
     """Make robots without a heartbeat, which leave nothing at the broker; ``more``: capabilities beyond the usual."""
     robots: list[RecordingRobot] = []
 
-    def make(*owners: str, persisted: bool | None = True, **more: Any) -> RecordingRobot:
-        base = f"pebble/robots/robot{next(_numbers)}"
+    def make(*owners: str, persisted: bool | None = True, id_: str = "", **more: Any) -> RecordingRobot:
+        base = f"pebble/robots/{id_ or f'robot{next(_numbers)}'}"
         robot = RecordingRobot(broker.port, base, *owners, persisted=persisted, heartbeats=False)
         robots.append(robot)
         robot.deaf = not more.get("estop", True)
@@ -59,15 +59,6 @@ def robot_on(broker: Broker) -> Iterator[Make]:
         for metric in ("capabilities", "status", "link", "online", *states):
             robot.remove(metric)
         robot.close()
-
-
-@pytest.fixture
-def unread() -> Iterator[IO[str]]:
-    """The writing end of a pipe that is closed at its other end."""
-    reading, writing = os.pipe()
-    os.close(reading)
-    with os.fdopen(writing, "w") as output:
-        yield output
 
 
 # -- stop
@@ -120,12 +111,12 @@ def test_a_robot_that_does_not_answer_is_reported_and_ctrl_c_ends_it(robot_on: M
     assert robot.count("estop") == robot.count("drive-values") >= 2
 
 
-def test_a_stop_is_repeated_until_it_is_confirmed_although_nothing_can_be_printed(
-    robot_on: Make, url: str, unread: IO[str]
-) -> None:
+def test_a_stop_is_repeated_until_it_is_confirmed_although_nothing_can_be_printed(robot_on: Make, url: str) -> None:
     robot = robot_on("serial")
     robot.deaf = True
-    with running("estop", robot.id, url, stdout=unread) as process:
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as unread, running("estop", robot.id, url, stdout=unread) as process:
         assert until(lambda: robot.count("estop") >= 4)
         robot.deaf = False
         _, err = process.communicate(timeout=WAIT_S)

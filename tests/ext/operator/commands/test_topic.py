@@ -16,7 +16,7 @@ from pebble.contract import CHANNELS
 from pebble.errors import PebbleError
 from pebble.extensions.operator.client.names import Names
 from pebble.extensions.operator.commands import show
-from pebble.extensions.operator.commands.draft import draft
+from pebble.extensions.operator.commands.draft import Draft, draft
 from pebble.extensions.operator.contract.schemas import schemas
 from tests.commands.command_line import GOOB, Run, running
 from tests.kit.played_robot import RecordingRobot
@@ -103,9 +103,13 @@ def test_the_contract_for_programs(run: Run) -> None:
 # -- messages to publish, as the contract completes and refuses them
 
 
+def drafted(name: str, text: str, **options: Any) -> Draft:
+    return draft(Names(GOOB), name, text, **{"retain": None, "qos": None, "force": False, **options})
+
+
 def test_the_contract_fills_in_how_to_publish(tmp_path: Path) -> None:
     def made(name: str, text: str, **options: Any) -> tuple[str, bytes, int, bool]:
-        message = draft(Names(GOOB), name, text, **{"retain": None, "qos": None, "force": False, **options})
+        message = drafted(name, text, **options)
         assert message.warnings == ()
         return message.topic, message.payload, message.qos, message.retain
 
@@ -115,12 +119,13 @@ def test_the_contract_fills_in_how_to_publish(tmp_path: Path) -> None:
     assert made("flags/mqtt-video", "true", retain=False, qos=0)[2:] == (0, False)
     assert made("drive-values", "", retain=True)[3] is True  # removes the retained message
     assert made("drive-values", '{"x": 0}', retain=True, force=True)[3] is True
+    assert made("drive-values", '{"z": 0.5, "speed": 1}')[2:] == (1, False)
 
 
 @pytest.mark.parametrize("name", ["drive-values", "flags/reboot"])
 def test_a_retained_command_is_refused(name: str) -> None:
     with pytest.raises(PebbleError, match="--force"):
-        draft(Names(GOOB), name, "true", retain=True, qos=None, force=False)
+        drafted(name, "true", retain=True)
 
 
 @pytest.mark.parametrize(
@@ -134,13 +139,7 @@ def test_a_retained_command_is_refused(name: str) -> None:
     ],
 )
 def test_doubtful_messages_are_sent_with_a_warning(name: str, text: str, doubt: str) -> None:
-    message = draft(Names(GOOB), name, text, retain=None, qos=None, force=False)
-    assert any(doubt in one for one in message.warnings)
-
-
-@pytest.mark.parametrize("text", ['{"x": 0}', '{"z": 0.5, "speed": 1}'])
-def test_a_stop_and_a_command_with_an_axis_are_sent_without_a_warning(text: str) -> None:
-    assert draft(Names(GOOB), "drive-values", text, retain=None, qos=None, force=False).warnings == ()
+    assert any(doubt in one for one in drafted(name, text).warnings)
 
 
 # -- how messages and rates are printed

@@ -17,8 +17,7 @@ from pebble.extensions.recordings.catalogue import look_at
 from pebble.extensions.recordings.files.reader import RecordingFile
 from pebble.extensions.recordings.files.recorded import UNNAMED, RecordingError
 from pebble.extensions.recordings.files.rewrite import rewrite
-from tests.ext.recordings.demo_robots import DRIVE, MEDIA
-from tests.ext.recordings.messages import START_NS, STEP_NS, contents, is_part_of, read, write
+from tests.ext.recordings.messages import DRIVE, MEDIA, START_NS, STEP_NS, contents, read, write
 from tests.kit.npm import package
 from tests.support import cases
 
@@ -53,12 +52,17 @@ def by_mcap_core(paths: list[Path]) -> list[Counted]:
     return [Counted(*map(int, line.split())) for line in done.stdout.splitlines()]
 
 
-MESSAGES = 2000
 TIMES = cases(1, 6)
 
 
+def is_part_of(some: list[tuple[str, bytes]], whole: list[tuple[str, bytes]]) -> bool:
+    """Whether ``some`` are in ``whole``, in its order."""
+    rest = iter(whole)
+    return all(one in rest for one in some)
+
+
 class TestWhole:
-    @pytest.mark.parametrize("count", [MESSAGES, 0])
+    @pytest.mark.parametrize("count", [2000, 0])
     def test_other_readers_read_it(self, tmp_path: Path, count: int) -> None:
         path = tmp_path / "a.mcap"
         written = write(path, count)
@@ -133,11 +137,10 @@ def lose_a_part(raw: bytearray, rng: random.Random) -> None:
     del raw[begin : begin + rng.randrange(60_000)]
 
 
-DAMAGES = [(flip, True), (zero_a_page, False), (end_in_zeros, False), (lose_a_part, True)]
-
-
 class TestDamaged:
-    @pytest.mark.parametrize(("damage", "finished"), DAMAGES)
+    @pytest.mark.parametrize(
+        ("damage", "finished"), [(flip, True), (zero_a_page, False), (end_in_zeros, False), (lose_a_part, True)]
+    )
     def test_all_that_is_left_is_read_mended_and_what_is_missing_is_known(
         self, tmp_path: Path, damage: Callable[[bytearray, random.Random], None], finished: bool
     ) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -10,15 +9,13 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from pebble.extensions.recordings import library
 from pebble.extensions.recordings.files.recorded import Recorded
-from pebble.extensions.recordings.recorder.intake import EVENTS
 from pebble.transports import Message, MqttSettings, QoS, Transport, create
 from tests.commands.command_line import Run, program
+from tests.ext.recordings.recorder.test_recorder import events, payloads, recorded
 from tests.support import WAIT_S, AmqttBroker, Broker, until
 
 GOOB = "pebble/robots/goob"
@@ -31,7 +28,7 @@ def recording(root: Path, port: int, *options: str) -> Iterator[subprocess.Popen
     """A recorder that is connected, and ends in order at the end."""
     with program("record", "--url", f"mqtt://127.0.0.1:{port}", "--into", root, *options) as process:
         try:
-            assert until(lambda: events(recorded(root), "connected"), step=0.2)
+            assert until(lambda: events(root, "connected"), step=0.2)
             yield process
         finally:
             process.send_signal(signal.SIGINT)
@@ -42,11 +39,6 @@ def client(port: int, name: str = "robot") -> Transport:
     return create("mqtt", name, MqttSettings(host="127.0.0.1", port=port)).open()
 
 
-def recorded(root: Path) -> list[Recorded]:
-    """What is in the files so far; a recorder that runs has none before its first write."""
-    return list(library.merged(library.files([root]))) if any(root.rglob("*.mcap*")) else []
-
-
 def of(messages: list[Recorded], topic: str) -> list[bytes]:
     return [message.payload for message in messages if message.channel.topic == topic]
 
@@ -55,10 +47,6 @@ def old_topics(root: Path) -> set[str]:
     """Those of the many values that were retained before."""
     old = (one.channel.topic for one in recorded(root) if one.channel.metadata.get("retained") == "1")
     return {topic for topic in old if "/many/" in topic}
-
-
-def events(messages: list[Recorded], name: str) -> list[dict[str, Any]]:
-    return [event for event in map(json.loads, of(messages, EVENTS)) if event["event"] == name]
 
 
 class Reference:
@@ -95,7 +83,7 @@ def test_what_a_subscriber_sees_is_recorded_byte_for_byte_with_its_flags(tmp_pat
         robot.publish(STATUS, b"{}", qos=QoS.DELIVERED, retain=True)
         robot.publish("replay/robots/goob/outgoing/online", b"{}", retain=True)
         robot.publish("pebble/infrastructure", b"1")
-        assert until(lambda: of(recorded(tmp_path / "rec"), "pebble/infrastructure"), step=0.2)
+        assert until(lambda: payloads(tmp_path / "rec", "pebble/infrastructure"), step=0.2)
         assert until(lambda: len(old_topics(tmp_path / "rec")) == 1500, step=0.2)  # they are fetched beside
     found = recorded(tmp_path / "rec")
     for topic in (AUDIO, DRIVE):
@@ -122,7 +110,7 @@ def test_a_broker_that_knows_only_mqtt_3(tmp_path: Path) -> None:
         reference = Reference(broker.port)
         with recording(tmp_path / "rec", broker.port):
             publish_all(robot, reference, 50)
-            assert until(lambda: len(of(recorded(tmp_path / "rec"), DRIVE)) == 50, step=0.2)
+            assert until(lambda: len(payloads(tmp_path / "rec", DRIVE)) == 50, step=0.2)
         found = recorded(tmp_path / "rec")
         assert of(found, DRIVE) == reference.of(DRIVE)
         assert next(one.channel.metadata for one in found if one.channel.topic == DRIVE) == {"qos": "1"}
@@ -141,8 +129,8 @@ def test_an_outage_is_a_gap(tmp_path: Path) -> None:
         time.sleep(3.0)
         os.kill(broker.pid, signal.SIGCONT)
         ended = time.time()
-        assert until(lambda: events(recorded(root), "gap"), step=0.2)
-    (gap,) = events(recorded(root), "gap")
+        assert until(lambda: events(root, "gap"), step=0.2)
+    (gap,) = events(root, "gap")
     assert gap["why"] == "no connection"
     assert gap["since"] / 1e3 == pytest.approx(began, abs=3.0)  # a silence is noticed after two seconds
     assert ended - 0.5 <= gap["until"] / 1e3 <= ended + 4.0

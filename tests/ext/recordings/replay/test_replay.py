@@ -6,8 +6,7 @@ import json
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -18,7 +17,7 @@ from tests.commands.command_line import Run, program
 from tests.ext.recordings import messages
 from tests.ext.recordings.playing import FRED, GOOB, Line, demo, js, ms, write
 from tests.ext.recordings.recorder.test_record import Reference
-from tests.support import WAIT_S, Broker, until
+from tests.support import WAIT_S, Broker, beside, until
 
 REPLAYED = "replay/robots/goob"
 ONLINE, STATUS, LOGS = (f"{REPLAYED}/outgoing/{metric}" for metric in ("online", "status", "logs"))
@@ -65,15 +64,6 @@ def walk(folder: Path, seconds: int = 60) -> Path:
         lines.append(Line(at + 0.01, f"{GOOB}/outgoing/logs", js(t=ms(at), n=number)))
         lines.append(Line(at + 0.02, f"{GOOB}/incoming/drive-values", js(x=0, z=0.5), 1))
     return write(folder / "walk.mcap", lines)
-
-
-@contextmanager
-def meanwhile(job: Callable[[], object]) -> Iterator[None]:
-    """``job`` on a thread of its own."""
-    thread = threading.Thread(target=job)
-    thread.start()
-    yield
-    thread.join(WAIT_S)
 
 
 def test_replayed_at_ten_times_its_speed_it_is_the_same(
@@ -148,7 +138,7 @@ def test_a_broker_that_restarts_gets_the_rest(tmp_path: Path, run: Run) -> None:
         broker.start()  # it ends with this thread
         assert until(lambda: states(operator)[-1] is False)
 
-    with meanwhile(restart):
+    with beside(restart, threading.Event()):
         assert run("replay", walk(tmp_path, 3), "--url", f"mqtt://127.0.0.1:{broker.port}") == 0
     numbers = [json.loads(payload)["n"] for payload in operator.of(LOGS)]
     assert numbers == sorted(numbers)

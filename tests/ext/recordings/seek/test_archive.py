@@ -6,21 +6,56 @@ import random
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pebble.extensions.media.decode import VideoDecoder
+from pebble.extensions.media.scene import Scene
+from pebble.extensions.media.video import make_encoder
 from pebble.extensions.recordings.files.recorded import Recorded, finished_path
 from pebble.extensions.recordings.library import files, merged
 from pebble.extensions.recordings.recorder.folder import Folder
 from pebble.extensions.recordings.recorder.lane import CARRIED, Item, OpenFile
 from pebble.extensions.recordings.seek.archive import Archive
 from pebble.extensions.recordings.seek.days import Days
-from tests.ext.recordings.playing import FRED, GOOB, THEN_NS, Line, js, ms, write
-from tests.ext.recordings.seek.filming import CAMERA, FPS, SCENES, film
+from tests.ext.recordings.playing import FRED, GOOB, THEN_NS, Line, demo, js, ms, write
 from tests.kit.scene import read_counter
 
 SECONDS = 30
-ENCODINGS = ("json", "pbvd", "h264")
+FPS = 15
+SIZE = (320, 240)
+SCENES = 60  # after which pictures repeat: drawing takes longer than all else
+CAMERA = f"{GOOB}/outgoing/front-camera"
+
+
+def pictures(encoding: str, seconds: float) -> Iterator[Line]:
+    """The number in a picture is its own modulo SCENES."""
+    encoder = make_encoder(encoding, fps=FPS, quality=60, keyframe_interval=2 * FPS)
+    scene, made = Scene(*SIZE), list[np.ndarray]()
+    for number in range(SCENES):
+        made.append(np.empty((SIZE[1], SIZE[0], 3), np.uint8))
+        scene.render(number, made[-1])
+    for number in range(int(seconds * FPS)):
+        at = number / FPS
+        payload = encoder.encode(made[number % SCENES], ms(at))
+        if payload is not None:
+            yield Line(at, CAMERA, payload)
+
+
+def film(root: Path, encoding: str, seconds: float, *, finished: bool = True) -> Path:
+    """A folder as a recorder leaves it: one file of state, one of media, a chunk each second."""
+    day = root / "2023/11/14"
+    capabilities = js(t=ms(0), value={"video": {"available": True}})
+    offered = Line(0.0, f"{GOOB}/outgoing/capabilities", capabilities, 1, retain=True)
+    shown = [offered, *demo(seconds, [GOOB]), *pictures(encoding, seconds)]
+    lines = sorted(shown, key=lambda line: line.at)
+    media = [line for line in lines if line.topic in (CAMERA, f"{GOOB}/outgoing/audio")]
+    state = [line for line in lines if line.topic not in (CAMERA, f"{GOOB}/outgoing/audio")]
+    suffix = ".mcap" if finished else ".mcap.active"
+    write(day / f"20231114T221320Z-000001.state{suffix}", state, finished=finished, chunk_ns=10**9)
+    name = f"20231114T221320Z-000002.media.{GOOB.replace('/', '.')}{suffix}"
+    write(day / name, media, finished=finished, chunk_ns=10**9)
+    return root
 
 
 @pytest.fixture(scope="module", params=["finished", "being written"])
@@ -40,14 +75,12 @@ def everything(folder: Path) -> list[Recorded]:
     return list(merged(files([folder])))
 
 
-def moments(count: int = 25) -> list[int]:
-    """Nanoseconds, at random and at messages."""
-    chance = random.Random(7)
-    return [THEN_NS + round(1e9 * chance.uniform(0.5, SECONDS)) for _ in range(count)] + [THEN_NS + 12 * 10**9]
-
-
 def at_ns(seconds: float) -> int:
     return THEN_NS + round(seconds * 1e9)
+
+
+#: At random and at messages.
+MOMENTS = [*(at_ns(random.Random(seed).uniform(0.5, SECONDS)) for seed in range(25)), at_ns(12)]
 
 
 def texts(messages: list[Recorded]) -> list[tuple[int, str, bytes]]:
@@ -55,7 +88,7 @@ def texts(messages: list[Recorded]) -> list[tuple[int, str, bytes]]:
 
 
 def test_a_period_holds_exactly_its_messages(archive: Archive, everything: list[Recorded]) -> None:
-    for begin in moments():
+    for begin in MOMENTS:
         end = begin + 2 * 10**9
         wanted = [one for one in everything if begin <= one.log_ns < end]
         assert sorted(texts(archive.messages(GOOB, begin, end))) == sorted(texts(wanted))
@@ -63,7 +96,7 @@ def test_a_period_holds_exactly_its_messages(archive: Archive, everything: list[
 
 
 def test_the_state_is_the_newest_value_of_each_topic(archive: Archive, everything: list[Recorded]) -> None:
-    for at in moments():
+    for at in MOMENTS:
         newest = {
             one.channel.topic: one
             for one in everything
@@ -92,7 +125,7 @@ def test_log_lines_before_a_time_are_there(archive: Archive) -> None:
     assert [one.payload.split(b'"')[-2] for one in lines] == [b"line 250", b"line 750", b"line 1250"]
 
 
-@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("encoding", ["json", "pbvd", "h264"])
 def test_the_picture_at_a_time_is_the_one_that_was_there(tmp_path: Path, encoding: str) -> None:
     archive = Archive(film(tmp_path, encoding, 10))
     chance = random.Random(3)

@@ -1,21 +1,28 @@
-"""The analysis gives what a plain computation over the messages gives."""
+"""The index has a row for each message, and the analysis gives what a plain computation over the messages gives."""
 
 from __future__ import annotations
 
+import errno
+import os
 import re
+import shutil
 import statistics
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import pytest
 
 from pebble.errors import PebbleError
 from pebble.extensions.media.packets import Codec, Picture, PictureKind, Sound
 from pebble.extensions.recordings.files.recorded import Recorded
 from pebble.extensions.recordings.library import merged
+from pebble.extensions.recordings.traffic.activity import Activity
 from pebble.extensions.recordings.traffic.analysis import analyse
+from pebble.extensions.recordings.traffic.index import COLUMNS, PICTURE, SOUND, index_path, write_index
 from pebble.extensions.recordings.traffic.report import remarks, write_report
 from pebble.extensions.recordings.traffic.results import (
     ALL,
@@ -33,24 +40,39 @@ from pebble.extensions.recordings.traffic.results import (
 )
 from pebble.extensions.recordings.traffic.sources import sources
 from pebble.extensions.recordings.traffic.tables import tables, write_csv
-from tests.ext.recordings.demo_robots import BENJR, DRIVE, FRED, GOOB, MEDIA
-from tests.ext.recordings.traffic.test_index import START_NS, Sent, demo_folder, event, write_recording
+from tests.ext.recordings.messages import DRIVE, MEDIA
+from tests.ext.recordings.playing import FRED, GOOB, THEN_NS, Line, js, ms, write
+from tests.support import refused
 
-pytest.importorskip("duckdb")
+duckdb = pytest.importorskip("duckdb")
 pytest.importorskip("matplotlib")
 
+BENJR = "pebble/robots/benjr"
 SECOND, MS = 10**9, 10**6
 
 
-def analysed(folder: Path, messages: Iterable[Sent], scratch: Path, **options: object) -> Traffic:
-    write_recording(folder / "x.mcap", messages)
-    return analyse(sources([folder], scratch), scratch, **options)
+def demo_folder(folder: Path) -> Path:
+    """What was recorded of the demo's robots; the file of media is being written."""
+    folder.mkdir(parents=True)
+    shutil.copy2(DRIVE, folder / "a.state.mcap")
+    (folder / "b.media.mcap.active").write_bytes(MEDIA.read_bytes()[:-200])
+    return folder
+
+
+def event(at: float, name: str, **about: Any) -> Line:
+    """What the recorder notes about itself."""
+    return Line(at, "$recorder/events", js(t=ms(at), event=name, **about))
 
 
 @pytest.fixture
 def of(tmp_path):
     """The traffic of some messages."""
-    return lambda messages, **options: analysed(tmp_path / "recordings", messages, tmp_path / "scratch", **options)
+
+    def analysed(messages: Iterable[Line]) -> Traffic:
+        path = write(tmp_path / "recordings" / "x.mcap", messages)
+        return analyse(sources([path], tmp_path / "scratch"), tmp_path / "scratch")
+
+    return analysed
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +82,7 @@ def recorded(tmp_path_factory) -> Traffic:
     return analyse(sources([demo_folder(folder / "recordings")], folder / "scratch"), folder / "scratch")
 
 
-def robot(found: Traffic, base: str) -> RobotTraffic:
+def robot(found: Traffic, base: str = GOOB) -> RobotTraffic:
     return next(one for one in found.robots if one.robot == base)
 
 
@@ -80,26 +102,19 @@ def messages_of(base: str, suffix: str) -> list[Recorded]:
     ]
 
 
-def kbps_by_second(messages: Iterable[Recorded]) -> list[float]:
-    seconds: dict[int, int] = defaultdict(int)
-    for message in messages:
-        seconds[message.log_ns // SECOND] += len(message.payload)
-    return [size * 8 / 1000 for size in seconds.values()]
-
-
 @pytest.mark.parametrize(
     ("base", "family", "suffix"),
-    [
-        (FRED, VIDEO, "outgoing/front-camera"),
-        (BENJR, HEARTBEATS, "outgoing/online"),
-    ],
+    [(FRED, VIDEO, "outgoing/front-camera"), (BENJR, HEARTBEATS, "outgoing/online")],
 )
 def test_bandwidth_is_that_of_active_seconds(recorded, base, family, suffix):
     messages = messages_of(base, suffix)
-    expected = kbps_by_second(messages)
+    seconds: dict[int, int] = defaultdict(int)
+    for message in messages:
+        seconds[message.log_ns // SECOND] += len(message.payload)
     one = robot(recorded, base).of(family)
-    assert (one.seconds, one.messages) == (len(expected), len(messages))
-    assert [one.median_kbps, one.p95_kbps] == pytest.approx(percentiles(expected))
+    assert (one.seconds, one.messages) == (len(seconds), len(messages))
+    expected = percentiles([size * 8 / 1000 for size in seconds.values()])
+    assert [one.median_kbps, one.p95_kbps] == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("base", [FRED, BENJR])
@@ -120,40 +135,29 @@ def test_intervals_outages_and_latency(recorded, base):
     assert [one.latency.median_ms, one.latency.p95_ms] == pytest.approx(percentiles(latencies))
 
 
-# -- what robots are like
-
-
 def test_a_component_without_heartbeats(of):
-    found = of([Sent(START_NS, "pebble/infrastructure/mast/outgoing/charging-level", b"{}")]).robots[0]
+    found = of([Line(0, "pebble/infrastructure/mast/outgoing/charging-level", b"{}")]).robots[0]
     assert (found.machine, found.interval_ms, found.latency, found.outages) == (COMPONENT, None, None, [])
 
 
 # -- outages
 
 
-def heartbeats(base: str, times: Iterable[float]) -> list[Sent]:
+def heartbeats(base: str, times: Iterable[float]) -> list[Line]:
     """Heartbeats at ``times`` in seconds."""
-    t = START_NS // MS
-    return [
-        Sent(
-            START_NS + round(at * SECOND),
-            f"{base}/outgoing/online",
-            b'{"t": %d, "online": true}' % (t + round(at * 1000)),
-        )
-        for at in times
-    ]
+    return [Line(at, f"{base}/outgoing/online", js(t=ms(at), online=True)) for at in times]
 
 
-def steady(base: str, *missing: tuple[float, float], seconds: float = 60.0) -> list[Sent]:
+def steady(base: str, *missing: tuple[float, float], seconds: float = 60.0) -> list[Line]:
     times = (number / 4 for number in range(int(seconds * 4)))
     return heartbeats(base, [at for at in times if not any(since < at < until for since, until in missing)])
 
 
-def ordered(*parts: Iterable[Sent]) -> list[Sent]:
-    return sorted((sent for part in parts for sent in part), key=lambda sent: sent.log_ns)
+def ordered(*parts: Iterable[Line]) -> list[Line]:
+    return sorted((sent for part in parts for sent in part), key=lambda sent: sent.at)
 
 
-GAP = event(START_NS + 22 * SECOND, "gap", since=START_NS // MS + 20_100, until=START_NS // MS + 21_900, why="lost")
+GAP = event(22, "gap", since=ms(20.1), until=ms(21.9), why="lost")
 LATE = [number * 0.25 for number in range(20)] + [4.75 + 0.375 + number * 0.25 for number in range(20)]
 
 
@@ -164,38 +168,38 @@ LATE = [number * 0.25 for number in range(20)] + [4.75 + 0.375 + number * 0.25 f
         (heartbeats(GOOB, LATE), []),  # of up to one and a half
         (steady(GOOB, (20.0, 90.0), seconds=120.0), []),  # above a minute it was offline
         (ordered(steady(GOOB, (20.0, 22.0), (40.0, 41.0)), [GAP]), [750.0]),  # what was not recorded is none
-        (ordered(steady(GOOB, (20.0, 22.0)), [event(START_NS + 21 * SECOND, "start")]), []),
+        (ordered(steady(GOOB, (20.0, 22.0)), [event(21, "start")]), []),
     ],
     ids=["missing", "late", "offline", "not recorded", "the recorder starts"],
 )
 def test_outages(of, messages, lengths_ms):
     found = of(messages)
-    assert [outage.length_ms for outage in robot(found, GOOB).outages] == lengths_ms
+    assert [outage.length_ms for outage in robot(found).outages] == lengths_ms
     assert [(gap.until_ns - gap.since_ns, gap.why) for gap in found.gaps] == [(1800 * MS, "lost")] * (GAP in messages)
 
 
 def test_messages_that_were_dropped_are_counted(of):
-    noted = [event(START_NS, "dropped", messages=7, why="the disk is too slow")]
-    gap = [event(START_NS + SECOND, "gap", since=START_NS // MS, until=START_NS // MS + 1000, why="full", messages=5)]
+    noted = [event(0, "dropped", messages=7, why="the disk is too slow")]
+    gap = [event(1, "gap", since=ms(0), until=ms(1), why="full", messages=5)]
     assert of([*noted, *gap, *heartbeats(GOOB, [2.0])]).dropped == 12
 
 
 def test_the_last_heartbeat_of_a_connection_does_not_count(of):
-    will = Sent(START_NS + 10 * SECOND + 100 * MS, f"{GOOB}/outgoing/online", b'{"t": 5, "online": false}')
-    assert robot(of(ordered(steady(GOOB), [will])), GOOB).latency.count == 240
+    will = Line(10.1, f"{GOOB}/outgoing/online", b'{"t": 5, "online": false}')
+    assert robot(of(ordered(steady(GOOB), [will]))).latency.count == 240
 
 
 # -- sessions
 
 
-def drive(*times: float, moving: bool = True) -> list[Sent]:
+def drive(*times: float, moving: bool = True) -> list[Line]:
     payload = b'{"x":0,"z":0.5}' if moving else b'{"x":0,"z":0}'
-    return [Sent(START_NS + round(at * SECOND), f"{GOOB}/incoming/drive-values", payload) for at in times]
+    return [Line(at, f"{GOOB}/incoming/drive-values", payload) for at in times]
 
 
 def sessions(found: Traffic) -> list[tuple[int, int]]:
-    start = START_NS // SECOND
-    return [(one.since_s - start, one.until_s - start) for one in robot(found, GOOB).sessions]
+    start = THEN_NS // SECOND
+    return [(one.since_s - start, one.until_s - start) for one in robot(found).sessions]
 
 
 @pytest.mark.parametrize(
@@ -205,7 +209,7 @@ def sessions(found: Traffic) -> list[tuple[int, int]]:
         (drive(10.0, 130.0), [(5, 136)]),  # a break of two minutes belongs to it
         (drive(10.0, 131.0), [(5, 16), (126, 137)]),
         (drive(10.0, moving=False), []),
-        ([Sent(START_NS, f"{GOOB}/outgoing/logs", b'{"level":"ERROR"}')], []),
+        ([Line(0, f"{GOOB}/outgoing/logs", b'{"level":"ERROR"}')], []),
     ],
 )
 def test_sessions(of, messages, expected):
@@ -213,7 +217,7 @@ def test_sessions(of, messages, expected):
 
 
 def test_bandwidths_of_sessions_and_of_idle_time_are_apart(of):
-    goob = robot(of(ordered(steady(GOOB), drive(10.0, 11.0))), GOOB)
+    goob = robot(of(ordered(steady(GOOB), drive(10.0, 11.0))))
     assert [goob.of(TOTAL, when).messages for when in (SESSION, IDLE)] == [48 + 2, 240 - 48]
     assert sum(goob.of(TOTAL, when).bytes for when in (SESSION, IDLE)) == goob.of(TOTAL, ALL).bytes == goob.bytes
 
@@ -221,13 +225,13 @@ def test_bandwidths_of_sessions_and_of_idle_time_are_apart(of):
 @pytest.mark.parametrize(
     ("metric", "payload", "family"),
     [
-        ("incoming/audio-stream", Sound(Codec.OPUS, 1, 48000, 960, 1, START_NS // MS, b"opus").pack(), VOICE),
-        ("outgoing/rear-camera", Picture(PictureKind.JPEG, 1, START_NS // MS, b"\xff\xd8").pack(), VIDEO),
+        ("incoming/audio-stream", Sound(Codec.OPUS, 1, 48000, 960, 1, ms(0), b"opus").pack(), VOICE),
+        ("outgoing/rear-camera", Picture(PictureKind.JPEG, 1, ms(0), b"\xff\xd8").pack(), VIDEO),
         ("incoming/front-camera", b'{"enabled":true}', None),  # a request for pictures
     ],
 )
 def test_media_are_counted_by_what_they_are(of, metric, payload, family):
-    found = robot(of([Sent(START_NS, f"{GOOB}/{metric}", payload)]), GOOB)
+    found = robot(of([Line(0, f"{GOOB}/{metric}", payload)]))
     assert [kind for kind in (VIDEO, AUDIO, VOICE) if found.of(kind)] == [kind for kind in (family,) if kind]
 
 
@@ -236,8 +240,8 @@ def test_media_are_counted_by_what_they_are(of, metric, payload, family):
 
 def test_a_file_that_is_being_written_is_read_and_not_indexed(tmp_path):
     folder, scratch = tmp_path / "it's [1] *?", tmp_path / "scratch"  # no pattern
-    write_recording(folder / "a.mcap", steady(GOOB, seconds=2.0))
-    write_recording(folder / "b.mcap.active", steady(FRED, seconds=3.0), finished=False)
+    write(folder / "a.mcap", steady(GOOB, seconds=2.0))
+    write(folder / "b.mcap.active", steady(FRED, seconds=3.0), finished=False)
     found = sources([folder], scratch)
     assert (len(found.indexes), found.robots) == (2, [FRED, GOOB])
     assert [path.name for path in folder.glob("*.parquet")] == ["a.parquet"]
@@ -246,13 +250,120 @@ def test_a_file_that_is_being_written_is_read_and_not_indexed(tmp_path):
 
 
 def test_a_damaged_index_is_named(tmp_path):
-    write_recording(tmp_path / "a.mcap", steady(GOOB, seconds=2.0))
+    write(tmp_path / "a.mcap", steady(GOOB, seconds=2.0))
     found = sources([tmp_path], tmp_path / "scratch")
     found.indexes[0].write_bytes(b"no Parquet")
     with pytest.raises(PebbleError) as error:
         analyse(found, tmp_path / "scratch")
     assert "a.parquet" in str(error.value)
     assert "\n" not in str(error.value)
+
+
+# -- the index: made again when needed, and never seen half made
+
+
+NAME = "2025/11/20/20251120T010000Z-000001.state.mcap"
+
+
+def query(sql: str, *parameters: object) -> list[tuple]:
+    with duckdb.connect() as connection:
+        return connection.execute(sql, parameters).fetchall()
+
+
+def rows(archive: Path, columns: str, where: str = "true") -> list[tuple]:
+    """Read as other programs would: by a pattern."""
+    return query(f"SELECT {columns} FROM '{archive}/**/*.parquet' WHERE {where} ORDER BY ts, metric")
+
+
+def index(archive: Path, messages: list[Line], name: str = NAME) -> None:
+    path = write(archive / name, messages)
+    write_index(path, index_path(path), archive / "scratch")
+
+
+def in_turn(*parts: tuple[str, bytes]) -> list[Line]:
+    """Messages by topic, a millisecond apart."""
+    return [Line(number / 1000, topic, payload) for number, (topic, payload) in enumerate(parts)]
+
+
+@pytest.mark.parametrize("recording", [DRIVE, MEDIA], ids=["drive", "media"])
+def test_each_message_is_a_row(tmp_path, recording):
+    index = index_path(tmp_path / "a.mcap")
+    write_index(recording, index, tmp_path / "scratch")
+    found = rows(tmp_path, "epoch_ns(ts), robot || '/' || direction || '/' || metric, size, retained", "robot != ''")
+    expected = [
+        (one.log_ns, one.channel.topic, len(one.payload), "retained" in one.channel.metadata)
+        for one in merged([recording])
+        if not one.channel.topic.startswith("$")
+    ]
+    assert sorted(found) == sorted(expected)
+    described = "SELECT column_name, column_type FROM (DESCRIBE FROM read_parquet(?))"
+    assert dict(query(described, str(index))) == COLUMNS
+
+
+USES = [
+    ("incoming/drive-values", b'{"x":0.1,"z":0}', Activity.DRIVE),
+    ("incoming/drive-values", b'{"x":0.01,"z":-0.02}', Activity.NONE),
+    ("incoming/drive-values", b'{"x":NaN}', Activity.NONE),
+    ("incoming/lights-flash", b"{}", Activity.LIGHTS),
+    ("incoming/front-camera", b'{"enabled":true}', Activity.MEDIA_REQUEST),
+    ("incoming/flags/mqtt-audio", b"true", Activity.MEDIA_REQUEST),
+    ("incoming/soundboard-command", b"{}", Activity.SOUND),
+    ("incoming/autonomy-command", b"{}", Activity.AUTONOMY),
+    ("incoming/audio-stream", Sound(Codec.PCM16LE, 1, 16000, 2, 1, 1, bytes(4)).pack(), Activity.MEDIA),
+    ("outgoing/front-camera", b'{"id": 1, "keyframe": true}', Activity.MEDIA),
+    ("outgoing/logs", b'{"level": "WARNING", "message": "hot"}', Activity.WARNING),
+    ("outgoing/logs", b'{"level": "INFO", "message": "WARNING"}', Activity.NONE),
+    ("outgoing/online", b'{"t":1,"online":true}', Activity.NONE),
+    ("outgoing/online", b'{"t":1}', Activity.NONE),
+    ("outgoing/heartbeat", b'{"t":1, "online": false}', Activity.NONE),
+]
+
+
+def test_the_use_of_a_robot_shows(tmp_path):
+    index(tmp_path, in_turn(*((f"{GOOB}/{suffix}", payload) for suffix, payload, _ in USES)))
+    assert rows(tmp_path, "activity") == [(activity,) for _, _, activity in USES]
+    assert rows(tmp_path, "medium", "medium IS NOT NULL") == [(SOUND,), (PICTURE,)]
+    assert rows(tmp_path, "online", "online IS NOT NULL") == [(True,), (True,), (False,)]
+
+
+def test_a_robot_may_have_any_name_and_what_belongs_to_none_keeps_its_topic(tmp_path):
+    robots = [f"pebble/robots/{name}" for name in ("a.b", "x=y", "50% off", "..", "día", "it's", "a\\b")]
+    topics = ["pebble/infrastructure", "$SYS/uptime", "a/b/c/sideways/x"]
+    index(tmp_path, in_turn(*((f"{robot}/outgoing/status", b"{}") for robot in robots)), "it's.mcap")
+    index(tmp_path, in_turn(*((topic, b"{}") for topic in topics)), "none.mcap")
+    assert sorted(rows(tmp_path, "robot", "robot != ''")) == [(robot,) for robot in sorted(robots)]
+    assert rows(tmp_path, "direction, metric", "robot = ''") == [("", topic) for topic in topics]
+    assert sources([tmp_path], tmp_path / "scratch").robots == sorted(robots)
+
+
+def state(folder: Path) -> list[tuple[Path, int]]:
+    return [(path, path.stat().st_mtime_ns) for path in sorted(folder.rglob("*.parquet"))]
+
+
+HEARTBEATS = in_turn(*((f"{base}/outgoing/online", b"{}") for base in (FRED, GOOB) * 50))
+
+
+def test_a_recording_is_indexed_once_and_again_when_it_has_changed(tmp_path):
+    path = write(tmp_path / NAME, HEARTBEATS)
+    assert sources([tmp_path], tmp_path / "scratch").robots == [FRED, GOOB]
+    before = state(tmp_path)
+    sources([tmp_path], tmp_path / "scratch")
+    assert state(tmp_path) == before
+    write(path, HEARTBEATS[1::2])
+    assert sources([tmp_path], tmp_path / "scratch").robots == [GOOB]
+
+
+def test_a_failure_leaves_the_former_index_and_nothing_temporary(tmp_path, monkeypatch):
+    path = write(tmp_path / NAME, HEARTBEATS)
+    sources([tmp_path], tmp_path / "scratch")
+    before = state(tmp_path)
+    os.utime(path)
+
+    monkeypatch.setattr(Path, "replace", refused(errno.ENOSPC))
+    with pytest.raises(OSError):
+        sources([tmp_path], tmp_path / "scratch")
+    assert state(tmp_path) == before
+    assert {one.suffix for one in path.parent.iterdir()} == {".mcap", ".parquet"}
 
 
 # -- the report: one file that needs no other, in which no name of a robot does anything
@@ -275,18 +386,17 @@ def test_nothing_is_loaded_or_run_and_every_drawing_has_a_name(recorded, tmp_pat
 
 
 def test_gaps_and_losses_stand_out(recorded):
-    recorded = Traffic(**{name: getattr(recorded, name) for name in recorded.__struct_fields__})
-    recorded.gaps, recorded.dropped, recorded.missing = [Gap(START_NS, START_NS + 10**9, "lost")], 5, 7
-    assert remarks(recorded)[0].startswith("Nothing was recorded once")
-    assert "5 messages were not recorded" in remarks(recorded)[1]
-    assert "7 were lost to damage" in remarks(recorded)[1]
+    gaps = [Gap(THEN_NS, THEN_NS + 10**9, "lost")]
+    gap, losses, *_ = remarks(msgspec.structs.replace(recorded, gaps=gaps, dropped=5, missing=7))
+    assert gap.startswith("Nothing was recorded once")
+    assert "5 messages were not recorded" in losses
+    assert "7 were lost to damage" in losses
 
 
-def test_names_of_robots_do_nothing(tmp_path):
+def test_names_of_robots_do_nothing(of, tmp_path):
     robots = [f"pebble/robots/{name}" for name in (EVIL.replace("/", ""), "$x^2$ & 'y' \"z\"")]
-    sent = [Sent(START_NS + at * 10**8, f"{robots[at % 2]}/outgoing/online", b'{"t":1}') for at in range(60)]
-    found = analysed(tmp_path / "recordings", sent, tmp_path / "scratch")
-    page = write_report(found, tmp_path)[0].read_text()
+    sent = [Line(at / 10, f"{robots[at % 2]}/outgoing/online", b'{"t":1}') for at in range(60)]
+    page = write_report(of(sent), tmp_path)[0].read_text()
     assert EVIL not in page
     assert "&lt;img" in page
 

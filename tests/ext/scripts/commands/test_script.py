@@ -1,22 +1,28 @@
-"""``pebble script`` with a real broker and a robot whose manager is scripted."""
+"""``pebble script`` with a real broker and a robot whose manager is scripted, and programs to begin with."""
 
 from __future__ import annotations
 
 import json
+import os
+import re
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
 
-from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, codec
-from pebble.contract.payloads import AutonomyFiles, AutonomyStatus
+from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, WHEEL_ODOMETRY, Channel, codec
+from pebble.contract.payloads import AutonomyFiles, AutonomyStatus, WheelOdometry
 from pebble.errors import PebbleError
+from pebble.extensions.lab.simulation.world.script_robot import SimulatedRobot
 from pebble.extensions.operator.client.scripts import settings
 from pebble.transports import Message, MqttSettings, QoS, create
 from tests.commands.command_line import GOOB, Run, config_file
-from tests.support import Broker, until
+from tests.support import ROOT, Broker, until
 
 FORM: list[dict[str, Any]] = [
     {"key": "tag_id", "label": "Tag ID", "type": "int", "default": 13, "arg": "--tag-id", "min": 0, "max": 34},
@@ -151,3 +157,85 @@ def test_an_option_is_the_scripts_own_or_made_of_its_key(words: list[str]) -> No
         {"key": "preview", "type": "bool", "arg": "--preview"},
     ]
     assert settings({"file": "follow", "configs": form}, words) == {"tag_id": 7, "preview": True}
+
+
+# -- what ``pebble script new`` writes works as it is, and its test would notice if it did not
+
+
+def pytest_in(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *arguments]
+    environment = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}  # users have none; ours take seconds to import
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, env=environment)
+
+
+@pytest.fixture
+def folder(run: Run, tmp_path: Path) -> Path:
+    assert run("script", "new", "follow-me", "--folder", tmp_path) == 0, run.err
+    folder = tmp_path / "follow-me"
+    files = ["run.py", "test_follow_me.py", "room.json", "goob.json", "pytest.ini"]
+    assert run.out.splitlines() == [str(folder / file) for file in files]
+    return folder
+
+
+@pytest.mark.thorough
+def test_its_test_passes_and_fails_for_a_robot_that_turns_away(folder: Path) -> None:
+    assert "1 passed" in pytest_in(folder).stdout
+    script = folder / "run.py"
+    script.write_text(script.read_text().replace("0.35 * tag", "-0.35 * tag"))
+    assert "1 failed" in pytest_in(folder).stdout
+
+
+def test_it_is_a_script_of_less_than_30_lines(folder: Path) -> None:
+    script = folder / "run.py"
+    assert script.read_text().count("\n") < 30
+    done = subprocess.run([sys.executable, script, "--describe"], capture_output=True, text=True, check=True)
+    described = json.loads(done.stdout)
+    assert described["label"] == "follow-me"
+    assert [entry["arg"] for entry in described["configs"]] == ["--tag-id", "--distance-m"]
+
+
+def test_its_robot_is_one_and_its_folder_is_left_alone_the_next_time(folder: Path, run: Run) -> None:
+    assert run("check", folder / "goob.json") == 0, run.err
+    assert "autonomy_manager" in run.out
+    assert run("script", "new", "follow-me", "--folder", folder.parent) == 1
+    assert run.err == f"pebble: {folder} exists already: choose another name, or another --folder\n"
+
+
+@pytest.mark.parametrize("name", ["../out", "1st", "x" * 80])
+def test_a_name_that_no_module_could_have_is_refused(name: str, run: Run, tmp_path: Path) -> None:
+    assert run("script", "new", name, "--folder", tmp_path) == 1
+    assert run.err.startswith(f"pebble: {name!r}: a script's name is letters, digits, - and _")
+
+
+# -- the programs in docs/ext/scripts.md run as they stand there
+
+
+def programs(beginning: str) -> list[str]:
+    text = (ROOT / "docs/ext/scripts.md").read_text()
+    return [block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if block.startswith(beginning)]
+
+
+class Driven(SimulatedRobot):
+    """Its odometry is the truth, until it ends after 1.5 s: half of the way."""
+
+    def latest(self, channel: Channel, max_age: float = 1.0) -> Any:
+        start = self._start = getattr(self, "_start", self.body.pose)
+        if self.world.now() < 1.5:
+            way = ((self.body.pose.x - start.x) ** 2 + (self.body.pose.y - start.y) ** 2) ** 0.5
+            self.receive(WHEEL_ODOMETRY, WheelOdometry(value={"x_mm": 1000 * way}, timestamp=0.0))
+        return super().latest(channel, max_age)
+
+
+def test_the_first_script_is_what_pebble_script_new_writes() -> None:
+    assert programs('"""Follow a tag') == [(ROOT / "pebble/extensions/scripts/commands/starter/run.py.txt").read_text()]
+
+
+def test_a_loop_of_its_own_never_acts_on_what_is_old() -> None:
+    robot = Driven(ROOT / "pebble/extensions/lab/simulation/world/room.json")
+    start = robot.body.pose
+    (text,) = programs('"""Drive half a metre')
+    program = ModuleType("run")
+    exec(compile(text, "docs/ext/scripts.md", "exec"), vars(program))
+    robot.run(program.main, seconds=4.0)
+    end = robot.body.pose
+    assert ((end.x - start.x) ** 2 + (end.y - start.y) ** 2) ** 0.5 == pytest.approx(0.25, abs=0.06)

@@ -102,9 +102,9 @@ def test_a_rate_repeats_nothing_and_may_be_raised() -> None:
 # -- by odometry
 
 
-def blind(*, settings: FollowSettings | None = None, place: Place = FAR) -> OdomFollower:
+def blind(place: Place = FAR) -> OdomFollower:
     """A tag was seen at 0 s from the origin."""
-    robot = OdomFollower(settings or FollowSettings())
+    robot = OdomFollower(FollowSettings())
     robot.see(0.0, place, Pose(0.0, 0.0, 0.0))
     robot.step(0.0, Pose(0.0, 0.0, 0.0))
     return robot
@@ -121,7 +121,7 @@ def test_it_drives_on_to_where_the_tag_was() -> None:
 
 
 def test_the_goal_is_on_the_way_to_the_tag() -> None:
-    robot = blind(place=Place(1.6, math.radians(10)))
+    robot = blind(Place(1.6, math.radians(10)))
     goal = Pose(math.cos(math.radians(10)), -math.sin(math.radians(10)), 0.0)
     assert robot.step(1.0, goal).reason == "goal reached"
 
@@ -132,7 +132,7 @@ def test_it_drives_blind_for_a_bounded_time_and_without_odometry_waits_and_searc
     assert robot.step(6.1, Pose(0.5, 0.0, 0.0)).z == 0.0
     robot = blind()
     assert [robot.step(now, None).reason for now in (0.2, 0.5, 1.0)] == ["drive", "wait", "search"]
-    robot = blind(place=Place(1.0, 0.6))
+    robot = blind(Place(1.0, 0.6))
     assert [robot.step(now, None).reason for now in (0.3, 0.4)] == ["turn", "wait"], "late locations are no picture"
 
 

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 import random
+import re
+from collections.abc import Callable
+from itertools import count
 
 import pytest
 
-from pebble.contract.payloads import MotorPower
+from pebble.contract.payloads import Drive, ImuFast, ImuFastValues, MotorPower, Orientation, TouchValues, Vector
+from pebble.extensions.lab.simulation.board import SimulatedMcu
 from pebble.extensions.lab.simulation.motion import FULL_SPEED_MM_S, TRACK_MM
 from pebble.extensions.scripts.perception.hall import HallSample, HallWheel, SensorRange
-from pebble.extensions.scripts.perception.odometry import Directions, OdometrySettings
-from tests.ext.scripts.perception.wheels_rig import WheelsRig
+from pebble.extensions.scripts.perception.odometry import Directions, Odometry, OdometrySettings
 
 ONE_SENSOR = OdometrySettings(second_channel="none")
 FIELDS = """
@@ -20,6 +23,93 @@ FIELDS = """
     left_extrema_events right_extrema_events left_rejected_sign_flips right_rejected_sign_flips
     left_stall_events right_stall_events sample_seq publish_seq
 """
+_touch = re.compile(rb"T a0=(\d+) a1=(\d+) a2=(\d+)").fullmatch
+
+
+def powers(drive: Drive) -> MotorPower:
+    left, right = (max(-1.0, min(1.0, power)) for power in (drive.z + drive.x, drive.z - drive.x))
+    return MotorPower(left=left, right=right)
+
+
+def touches(output: bytes, noise: Callable[[], float]) -> tuple[list[TouchValues], bytes]:
+    """The hall sensors in what a board has sent, and what is left of it."""
+    *lines, rest = output.split(b"\n")
+    found = filter(None, map(_touch, (line.strip() for line in lines)))
+    values = [[int(value) + round(noise()) for value in one.groups()] for one in found]
+    return [TouchValues(a0=a0, a1=a1, a2=a2) for a0, a1, a2 in values], rest
+
+
+def turning(dps: float, now: float, seq: int = 0) -> ImuFast:
+    values = ImuFastValues(
+        accel_mps2=Vector(x=0, y=0, z=9.81),
+        gyro_dps=Vector(x=0, y=0, z=dps),
+        temp_c=30.0,
+        orientation_deg=Orientation(roll=0, pitch=0),
+    )
+    return ImuFast(t=0, seq=seq, mcu_ms=round(now * 1000), value=values)
+
+
+class WheelsRig:
+    """Goob's motor board and body; ``odometry`` receives the commands and samples that it would on the robot.
+
+    ``noise`` is in counts of the ADC, rms. With ``gyro``, an inertial sensor with noise and a bias of 0.3 degrees/s.
+    """
+
+    def __init__(
+        self,
+        *,
+        gyro: bool = False,
+        noise: float = 0.0,
+        geometry: OdometrySettings | None = None,
+        start_mm: tuple[float, float] = (0.0, 0.0),
+        gyro_sign: float = 1.0,
+    ) -> None:
+        self.now = 100.0
+        self.mcu = SimulatedMcu("goob", self.now)
+        self.motion = self.mcu.motion
+        self.motion.left_mm, self.motion.right_mm = start_mm
+        self.odometry = Odometry(geometry or OdometrySettings(), self.now)
+        self._gyro, self._noise, self._sign = gyro, noise, gyro_sign
+        self._random = random.Random(1)
+        self._received = b""
+        self._sequence = count()
+
+    def drive(self, seconds: float, x: float = 0.0, z: float = 0.0) -> None:
+        """Repeat a command for ``seconds``, then go on at once."""
+        end = self.now + seconds
+        while self.now < end - 1e-9:
+            self.command(Drive(x=x, z=z))
+            self.wait(min(0.1, end - self.now))
+
+    def stop(self, seconds: float = 0.6) -> None:
+        """Stop, and wait until the wheels stand."""
+        self.command(Drive())
+        self.wait(seconds)
+
+    def command(self, drive: Drive) -> None:
+        power = powers(drive)
+        self.odometry.power(power, self.now)
+        self._take(self.mcu.receive(b"M %.3f %.3f\n" % (power.left, power.right), self.now))
+
+    def wait(self, seconds: float) -> None:
+        end = self.now + seconds
+        while self.now < end - 1e-9:
+            self.now = min(end, self.now + 0.01)
+            self._take(self.mcu.tick(self.now))
+            if self._gyro:
+                turn = math.degrees((self.motion.right_mm_s - self.motion.left_mm_s) / TRACK_MM)
+                z = max(-327.0, min(327.0, self._sign * turn + 0.3 + self._random.gauss(0.0, 0.05)))
+                self.odometry.imu(turning(z, self.now, next(self._sequence)), self.now)
+
+    def error_mm(self) -> float:
+        """How far the pose is from the true one."""
+        pose = self.motion.pose
+        return math.hypot(self.odometry.pose.x_mm - pose.x_mm, self.odometry.pose.y_mm - pose.y_mm)
+
+    def _take(self, output: bytes) -> None:
+        found, self._received = touches(self._received + output, lambda: self._random.gauss(0.0, self._noise))
+        for values in found:
+            self.odometry.touch(values, self.now)
 
 
 @pytest.mark.parametrize(("power", "start"), [(0.4, 3), (-1.0, 2)])
@@ -44,7 +134,8 @@ def test_a_square_ends_where_it_began(side: int, gyro: bool) -> None:
         rig.drive(math.pi / 4 * TRACK_MM / FULL_SPEED_MM_S / 0.3, x=-side * 0.3)
         rig.stop()
     assert rig.error_mm() < 25
-    assert rig.error_deg() < 1.5
+    off = rig.odometry.pose.heading_rad - rig.motion.pose.heading_rad
+    assert abs(math.remainder(off, math.tau)) < math.radians(1.5)
     assert rig.odometry.value().get("heading_source") == {True: "gyro", False: None}[gyro]
 
 
@@ -55,9 +146,9 @@ def test_reversals_without_a_stop_lose_no_step() -> None:
     for _ in range(20):
         rig.drive(chosen.uniform(0.2, 2.0), x=chosen.uniform(-1, 1), z=chosen.uniform(-1, 1))
     rig.stop()
-    left, right = rig.wheel_errors_mm()
-    assert abs(left) < 2, "its second sensor shows the direction"
-    assert abs(right) < 10
+    value = rig.odometry.value()
+    assert value["left_mm"] == pytest.approx(rig.motion.left_mm, abs=2), "its second sensor shows the direction"
+    assert value["right_mm"] == pytest.approx(rig.motion.right_mm, abs=10)
 
 
 def test_all_fields_of_the_payload() -> None:

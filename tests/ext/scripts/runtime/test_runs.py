@@ -121,24 +121,21 @@ class Owner:
 def test_whatever_a_stranger_has_sent_the_next_run_moves_and_no_earlier_one(
     tmp_path: Path, restarted: str, first: int
 ) -> None:
+    path = tmp_path / "autonomy-run.json"
     for numbers, zero, during in product(HOSTILE, (False, True), (False, True)):
-        check_hostile(tmp_path / "autonomy-run.json", first, numbers, zero, during, restarted)
-
-
-def check_hostile(path: Path, first: int, numbers: list[int], zero: bool, during: bool, restarted: str) -> None:
-    path.write_text(f"{first:010d}\n")
-    owner, own = Owner(), _next(path, 0, clock)
-    if during:
-        assert owner.moves(own)
-    for number in numbers:
-        owner.arbiter.judge(not zero, (own + number) & LAST_RUN or LAST_RUN, -1, 5000)
-    received = numbers[-1] if restarted != "manager" else 0
-    if restarted == "owner":
-        owner = Owner(owner.arbiter.barred)
-    following = _next(path, owner.arbiter.barred, clock, received)
-    assert owner.moves(following)
-    if during and len(numbers) < 3:  # with three a stranger may have gone round all numbers
-        assert owner.arbiter.judge(True, own, -1, 5000) == REFUSED
-    owner.end()
-    assert not owner.moves(following), "a person's zero ends it, whatever came before"
-    assert owner.moves(_next(path, owner.arbiter.barred, clock, following))
+        path.write_text(f"{first:010d}\n")
+        owner, own = Owner(), _next(path, 0, clock)
+        if during:
+            assert owner.moves(own)
+        for number in numbers:
+            owner.arbiter.judge(not zero, (own + number) & LAST_RUN or LAST_RUN, -1, 5000)
+        received = numbers[-1] if restarted != "manager" else 0
+        if restarted == "owner":
+            owner = Owner(owner.arbiter.barred)
+        following = _next(path, owner.arbiter.barred, clock, received)
+        assert owner.moves(following)
+        if during and len(numbers) < 3:  # with three a stranger may have gone round all numbers
+            assert owner.arbiter.judge(True, own, -1, 5000) == REFUSED
+        owner.end()
+        assert not owner.moves(following), "a person's zero ends it, whatever came before"
+        assert owner.moves(_next(path, owner.arbiter.barred, clock, following))

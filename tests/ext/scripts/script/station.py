@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -17,9 +16,10 @@ from pebble.contract import DRIVE, ESTOP_STATE, codec
 from pebble.contract.payloads import Drive
 from pebble.runtime.connections import local_transport
 from pebble.transports import Message, QoS
+from tests.commands.command_line import config_file
 from tests.ext.operator.client.estop_robot import estop_state
-from tests.support import WAIT_S, Broker, Child, until
-from tests.transports.zenoh_net import HubProcess
+from tests.kit.robot import LocalNetwork
+from tests.support import WAIT_S, Child, until
 
 
 class Received(NamedTuple):
@@ -33,19 +33,11 @@ class Station:
     def __init__(self, kind: str) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="pbl")  # pytest's own may be too long for a socket
         self.folder = Path(self._folder.name)
-        self.broker = Broker(self.folder) if kind == "mqtt" else None
         (self.folder / "run").mkdir(mode=0o700)
         (self.folder / "run" / LAUNCHER_LOCK).write_text(f"{os.getpid()}\n")
-        self.hub = HubProcess(self.folder / "run").start() if kind == "zenoh" else None
-        self.config_path = self.folder / "goob.json"
-        port = 1883 if self.broker is None else self.broker.port
-        self.config_path.write_text(json.dumps({
-            "robot": {"id": "goob"},
-            "local_mqtt": {"host": "127.0.0.1", "port": port},
-            "transport": {"kind": kind, "run_dir": str(self.folder / "run")},
-            "services": {"neighbours": {"enabled": True, "listens": {"fred": ["wheel-odometry"]},
-                                        "lan": {"connect": ["tcp/127.0.0.1:7447"]}}},
-        }))  # fmt: skip
+        self._network = LocalNetwork(kind, self.folder)
+        transport = {"kind": kind, "run_dir": str(self.folder / "run")}
+        self.config_path = config_file(self.folder, local_mqtt=self._network.local_mqtt, transport=transport)
         self.config = load(self.config_path)
         self.received: list[Received] = []
         self._scripts: list[subprocess.Popen[str]] = []
@@ -54,13 +46,13 @@ class Station:
         self.transport.subscribe(DRIVE.topic(self.config.base), self._receive)
         self.publish_state()
 
-    def start(self, body: str, *options: str, run: int | None = None) -> subprocess.Popen[str]:
+    def start(self, body: str, run: int | None = None) -> subprocess.Popen[str]:
         """Start a script whose ``main(robot)`` is these lines; its output is one pipe."""
         path = self.folder / f"script{len(self._scripts)}.py"
         lines = "\n".join(f"    {line}" for line in body.splitlines())
         before, after = "import os, sys, time\nfrom pebble import Robot, run\n\n", "\n\nrun(main)\n"
         path.write_text(f"{before}def main(robot: Robot) -> None:\n{lines}{after}")
-        return self.start_file(path, *options, run=run)
+        return self.start_file(path, run=run)
 
     def start_file(self, path: Path, *options: str, run: int | None = None) -> subprocess.Popen[str]:
         """Start this program with the robot's config; ``run`` as the manager gives it."""
@@ -70,10 +62,10 @@ class Station:
         self._scripts.append(script)
         return script
 
-    def driven(self, body: str, **options: Any) -> subprocess.Popen[str]:
+    def driven(self, body: str, run: int | None = None) -> subprocess.Popen[str]:
         """Start it, and wait until it drives."""
         before = len(self.received)
-        script = self.start(body, **options)
+        script = self.start(body, run)
         assert until(lambda: self.moves(before)), script.communicate(timeout=WAIT_S)[0]
         return script
 
@@ -100,10 +92,7 @@ class Station:
                 script.send_signal(signal.SIGKILL)
             script.communicate(timeout=WAIT_S)
         self.transport.close()
-        if self.broker is not None:
-            self.broker.stop()
-        if self.hub is not None and self.hub.running:
-            self.hub.end()
+        self._network.close()
         self._folder.cleanup()
 
     def _receive(self, message: Message) -> None:

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,19 +15,34 @@ import pytest
 from pebble.contract.payloads import Drive
 from pebble.extensions.scripts.script import EXIT_ENDED
 from tests.commands.command_line import config_file
-from tests.ext.scripts.script.conftest import BOTH
 from tests.ext.scripts.script.station import Station
 from tests.support import WAIT_S, Child, until
 
 AT_ONCE_S = 1.0  # a few milliseconds, but not on a busy machine; a script that does not look is ended after two
 
-
 DRIVES = re.compile(r"\d\d:\d\d:\d\d \[INFO\] run \d+ drives goob\n").fullmatch
+#: For what depends on the transport: how a process ends.
+BOTH = pytest.mark.parametrize("shared", ["mqtt", "zenoh"], indirect=True)
 
 
-def ended(script: subprocess.Popen[str], timeout: float = WAIT_S) -> tuple[int, str]:
+@pytest.fixture(scope="module", params=["mqtt", pytest.param("zenoh", marks=pytest.mark.thorough)])
+def shared(request: pytest.FixtureRequest) -> Iterator[Station]:
+    station = Station(request.param)
+    yield station
+    station.close()
+
+
+@pytest.fixture
+def station(shared: Station) -> Station:
+    """Nothing was received, and the motor owner is free."""
+    shared.publish_state()
+    shared.received.clear()
+    return shared
+
+
+def ended(script: subprocess.Popen[str]) -> tuple[int, str]:
     """Its exit code, and what it has printed but that it drives."""
-    lines = script.communicate(timeout=timeout)[0].splitlines(keepends=True)
+    lines = script.communicate(timeout=WAIT_S)[0].splitlines(keepends=True)
     return script.returncode, "".join(line for line in lines if not DRIVES(line))
 
 

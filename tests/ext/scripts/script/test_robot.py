@@ -38,8 +38,8 @@ class Setting:
         )
         self.robot = Robot(config, transport, lambda above: above + 1, clock=lambda: self.now, **options)
 
-    def send(self, value: WheelOdometry, *, retain: bool = False) -> None:
-        self.other.publish(WHEEL_ODOMETRY.topic(BASE), codec.encode(WHEEL_ODOMETRY, value), retain=retain)
+    def send(self, value: WheelOdometry) -> None:
+        self.other.publish(WHEEL_ODOMETRY.topic(BASE), codec.encode(WHEEL_ODOMETRY, value))
 
     def close(self) -> None:
         self.robot.close()
@@ -128,10 +128,7 @@ def test_a_last_value_that_fails_keeps_nothing_from_ending(setting: Setting, cap
     assert "publish_at_end: no last mood" in caplog.text
 
 
-@pytest.mark.parametrize(
-    ("x", "error"),
-    [("left", ValueError), (None, TypeError), (math.nan, ValueError)],
-)
+@pytest.mark.parametrize(("x", "error"), [("left", ValueError), (None, TypeError), (math.nan, ValueError)])
 def test_what_is_no_number_is_named_and_drives_nothing(setting: Setting, x: Any, error: type[Exception]) -> None:
     for axis in ("x", "z"):
         with pytest.raises(error, match=rf"{axis} is (a number from -1 to 1, not |not a finite)"):
