@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import pytest
 
+from pebble.extensions.operator.client.media_request import shared
 from tests.ext.foxglove.live import Live, Watcher, client, live, parser
 from tests.ext.page.media.robots import (
     AUDIO,
@@ -35,6 +36,12 @@ from tests.support import Broker, until
 H264, JPEG, SAMPLES = f"{CAMERA}/video", f"{CAMERA}/image", f"{SOUND}/sound"
 REQUESTED, WITHDRAWN = {"enabled": True, "encoding": "h264"}, {"enabled": False}
 _nal_types = re.compile(rb"\x00\x00\x01(.)", re.DOTALL).findall
+
+
+@pytest.fixture(autouse=True)
+def _short_linger(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have requests withdrawn soon after the last client has left."""
+    monkeypatch.setattr(shared, "LINGER_S", 0.4)
 
 
 @contextmanager

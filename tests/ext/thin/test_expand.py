@@ -1,12 +1,14 @@
-"""`pebble topic expand`, and the page's server with `web_interface.expand`, at a real broker."""
+"""At real brokers: `pebble topic expand`, the page with `web_interface.expand`, and a bridge over a thin link."""
 
 from __future__ import annotations
 
 import asyncio
+import json
 import os
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -20,9 +22,14 @@ from pebble.extensions.operator.client.names import Names
 from pebble.extensions.page.server import expand
 from pebble.extensions.thin.expander import Expander
 from pebble.extensions.thin.packed import joined, packed
+from pebble.runtime.connections import local_transport
+from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.transports import MqttSettings, QoS, Transport, create
 from tests.ext.fleet.brokers import HOST, FleetBroker
-from tests.support import ROOT, WAIT_S, Broker, Child, free_port, until
+from tests.robot.operator import Operator
+from tests.services.mqtt_bridge.bridge_rig import BASE as ROVER
+from tests.services.mqtt_bridge.bridge_rig import Running, make_config
+from tests.support import ROOT, SOON_S, WAIT_S, Broker, Child, free_port, until
 
 BASE = "pebble/robots/goob"
 STREAMS = {"touch-sensors": b'{"value": {"a0": 1}}', "wheel-odometry": b'{"value": {"x": 1.50}}'}
@@ -114,3 +121,43 @@ def test_at_a_fleets_broker_it_has_an_account_of_its_own(
 
         assert until(arrives, WAIT_S if comes else 1) is comes
         assert bool(said) is comes, "it is not even said that it is there"
+
+
+IMU, STOP, ONLINE, LINK = "outgoing/sensors/imu", "incoming/estop", "outgoing/online", "outgoing/link"
+FLOOD = 3_000
+
+
+@pytest.fixture
+def brokers(tmp_path: Path) -> Iterator[list[Broker]]:
+    brokers = [Broker(tmp_path, "max_queued_messages 0"), Broker(tmp_path)]
+    yield brokers
+    for broker in brokers:
+        broker.stop()
+
+
+def test_a_stop_passes_at_once_while_much_waits(brokers: list[Broker]) -> None:
+    local, remote = brokers
+    config = make_config(
+        local_mqtt={"host": "127.0.0.1", "port": local.port},
+        remote_mqtt={"host": "127.0.0.1", "port": remote.port},
+        link={"profile": "thin", "kbit": 9.6},
+    )
+    running = Running(MqttBridge(config, local_transport(config, "local-bridge", as_published=True)))
+    robot, operator = Operator(local.port, ROVER), Operator(remote.port, ROVER)
+    assert until(lambda: operator.last(LINK) and len([one for one in operator.seen if one.topic.endswith(ONLINE)]) >= 2)
+    for number in range(FLOOD):
+        robot.send(IMU, {"n": number})
+    began = time.monotonic()
+    operator.send(STOP, {"stop": "00000000000000a1", "by": "test"})
+    assert until(lambda: robot.last(STOP))
+    stopped = robot.last(STOP)
+    assert stopped is not None
+    assert stopped.at - began < SOON_S
+    assert until(lambda: json.loads((operator.last(IMU) or stopped).payload).get("n") == FLOOD - 1)
+    arrived = [one for one in operator.seen if one.topic.endswith("imu")]
+    assert len(arrived) < FLOOD / 50
+    heartbeats = [one.at for one in operator.seen if one.topic.endswith(ONLINE)]
+    assert len(heartbeats) <= heartbeats[-1] - heartbeats[0] + 2.5, "one a second"
+    operator.close()
+    robot.close()
+    running.stop()

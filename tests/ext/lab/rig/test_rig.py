@@ -1,20 +1,49 @@
-"""An operator that is a program: rate, deadline and last zero of what it sends, and people before it."""
+"""Processes end in order; an operator that is a program keeps rate and deadline, and lets people go first."""
 
 from __future__ import annotations
 
 import json
 import time
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from pebble.contract import channel_of
 from pebble.contract.payloads import Drive
+from pebble.extensions.lab.rig.processes import BROKERS, MCUS, OPERATORS, ROBOTS, Processes, Program
 from pebble.extensions.lab.rig.scripted_operator import VALID_MS, ScriptedOperator
 from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.transports import Message, QoS
 from tests.ext.operator.client.control_robot import KeepingRobot
 from tests.ext.operator.client.estop_robot import Robot, capabilities
+from tests.support import until
+
+
+def write_when_ended(name: str, into: Path) -> list[str]:
+    """A program that appends its name to a file when it gets SIGTERM."""
+    return ["sh", "-c", f"trap 'echo {name} >> {into}; exit' TERM; touch {into}.{name}; while :; do sleep 0.01; done"]
+
+
+def test_operators_end_first_and_brokers_last(tmp_path: Path) -> None:
+    order = tmp_path / "order"
+    with Processes() as processes:
+        for name, kind in (("broker", BROKERS), ("mcu", MCUS), ("robot", ROBOTS), ("operator", OPERATORS)):
+            processes.add(Program(name, write_when_ended(name, order), tmp_path / f"{name}.log"), kind)
+            assert until(Path(f"{order}.{name}").exists)
+        assert processes.unexpected_exits() == []
+    assert order.read_text().split() == ["operator", "robot", "mcu", "broker"]
+    assert not processes.folder.exists()
+
+
+def test_one_that_ended_by_itself_is_named_and_one_that_was_ended_is_not(tmp_path: Path) -> None:
+    with Processes() as processes:
+        ended = processes.add(Program("the hub", ["true"], tmp_path / "hub.log"), BROKERS)
+        assert until(lambda: ended.ended)
+        assert processes.unexpected_exits() == [f"the hub ended unexpectedly: see {ended.log}"]
+        processes.end(ended)
+        assert processes.unexpected_exits() == []
+
 
 BASE = "pebble/robots/mine"
 DRIVE = f"{BASE}/incoming/drive-values"
