@@ -23,11 +23,11 @@ import pytest
 from pebble.contract import AUTONOMY_COMMAND, CONTROL_TAKE, DRIVE, ESTOP, ESTOP_RESET, codec
 from pebble.contract import channels as c
 from pebble.extensions.fleet import audit as audit_module
-from pebble.extensions.fleet import robot_audit as robot_audit
-from pebble.extensions.fleet import row_writer
+from pebble.extensions.fleet import robot_audit, row_writer
 from pebble.extensions.fleet.audit import OTHERS, Audit
 from pebble.extensions.fleet.people import People
-from pebble.extensions.fleet.robot_audit import ROBOT, RobotAudit, files
+from pebble.extensions.fleet.robot_audit import ROBOT, files
+from pebble.extensions.fleet.robot_audit import Audit as RobotAudit
 from pebble.extensions.fleet.row_writer import DIFFERENT, OF_STRANGERS, WAITING, WINDOW_S, RowWriter
 from pebble.forwarding.routing import Drop
 from tests.commands.command_line import Run

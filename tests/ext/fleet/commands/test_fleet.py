@@ -27,7 +27,7 @@ from pebble.extensions.fleet.roles import Role
 from pebble.extensions.lab.rig.processes import python
 from pebble.extensions.operator.places import mosquitto_path
 from tests.commands.command_line import Run, running
-from tests.ext.fleet.broker_client import BrokerClient, Place
+from tests.ext.fleet.brokers import BrokerClient, Place
 from tests.kit.terminal import Terminal
 from tests.support import ROOT, WAIT_S, Child, free_port, listening, until
 

@@ -1,4 +1,4 @@
-"""What setup makes works: its broker lets in whom it should; backups become robots again, or are refused in one line."""
+"""What setup makes works: its broker lets in whom it should; backups become robots again, or are refused."""
 
 from __future__ import annotations
 
