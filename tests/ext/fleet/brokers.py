@@ -148,11 +148,6 @@ class FleetBroker:
         return load(self.folder)
 
     @property
-    def pid(self) -> int:
-        assert self._process is not None
-        return self._process.pid
-
-    @property
     def place(self) -> Place:
         return Place(HOST, self.port, self.folder / CA_CERT)
 
@@ -192,8 +187,3 @@ class FleetBroker:
 
     def login(self, name: str) -> BrokerClient:
         return BrokerClient(self.place, name, self.passwords[name])
-
-
-def accounts(roles: Iterable[str]) -> dict[str, Account]:
-    """One account for each of these roles, named after it."""
-    return {role: Account(roles=(role,)) for role in roles}

@@ -367,16 +367,8 @@ SENSOR, STOP, ONLINE, LINK = "outgoing/sensors/imu", "incoming/estop", "outgoing
 FLOOD = 3_000
 
 
-@pytest.fixture
-def brokers(tmp_path: Path) -> Iterator[list[Broker]]:
-    brokers = [Broker(tmp_path, "max_queued_messages 0"), Broker(tmp_path)]
-    yield brokers
-    for broker in brokers:
-        broker.stop()
-
-
-def test_a_stop_passes_at_once_while_much_waits(brokers: list[Broker]) -> None:
-    local, remote = brokers
+def test_a_stop_passes_at_once_while_much_waits(tmp_path: Path, broker: Broker) -> None:
+    local, remote = Broker(tmp_path, "max_queued_messages 0"), broker
     config = make_config(
         local_mqtt={"host": "127.0.0.1", "port": local.port},
         remote_mqtt={"host": "127.0.0.1", "port": remote.port},
@@ -401,3 +393,4 @@ def test_a_stop_passes_at_once_while_much_waits(brokers: list[Broker]) -> None:
     operator.close()
     robot.close()
     running.stop()
+    local.stop()

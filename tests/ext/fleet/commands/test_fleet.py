@@ -106,13 +106,6 @@ def test_the_first_page_as_a_newcomer_types_it(
     assert subprocess.run(search, check=False, capture_output=True).stdout == b""  # no file has one of them
 
 
-def typed_alone(line: str, folder: Path) -> str:
-    """Return what a line prints that succeeds without a complaint."""
-    done = pebble(line, folder)
-    assert (done.returncode, done.stderr) == (0, ""), (line, done)
-    return done.stdout
-
-
 @contextmanager
 def typed(line: str, folder: Path) -> Iterator[None]:
     """A program that runs until it is ended."""
@@ -248,7 +241,8 @@ def test_two_robots_of_a_lan_and_a_board_receive_each_other_in_six_commands(tmp_
     hub, port = free_port(), free_port()
     text = (ROOT / "docs/many.md").read_text().partition("\n## A LAN with boards\n")[2].partition("\n## ")[0]
     make, *starts, _ = re.findall(r"^    (pebble .*)$", text.replace("hub.lab", "127.0.0.1"), re.MULTILINE)
-    typed_alone(f"{make} --port {port}", tmp_path)
+    made = pebble(f"{make} --port {port}", tmp_path)
+    assert (made.returncode, made.stderr) == (0, "")
     lan = tmp_path / "lan"
     (grants,) = re.findall(r"```jsonc\n//[^\n]*\n(.*?)```", text, re.DOTALL)
     gateway = lan / "gateway.json"

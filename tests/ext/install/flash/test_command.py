@@ -386,15 +386,6 @@ def test_an_unreachable_broker_is_reported_as_this_machines_problem(monkeypatch:
         at_broker(at_port(free_port()), timeout_s=1)
 
 
-@pytest.fixture
-def line() -> Iterator[tuple[str, int]]:
-    master, slave = os.openpty()
-    tty.setraw(slave)
-    yield os.ttyname(slave), master
-    os.close(master)
-    os.close(slave)
-
-
 def frame() -> bytes:
     """A HELLO without content, as pebble_serial_v1 puts it on the wire."""
     body = bytes((1, 1, 0, 0, 0, 0, 0, 0, 0, 7, 0, 0, 0))
@@ -412,14 +403,17 @@ def frame() -> bytes:
         ("goob_imu", b"x\0" + frame()[:-3] + b"\1\0", False),
     ],
 )
-def test_a_report_on_the_line_counts_and_other_bytes_are_shown(
-    robot: str, sent: bytes, is_report: bool, line: tuple[str, int]
-) -> None:
-    timer = threading.Timer(0.3, os.write, (line[1], sent))
+def test_a_report_on_the_line_counts_and_other_bytes_are_shown(robot: str, sent: bytes, is_report: bool) -> None:
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    line = os.ttyname(slave)
+    timer = threading.Timer(0.3, os.write, (master, sent))
     timer.start()
     if is_report:
-        assert on_serial_port(line[0], FIRMWARE[robot], timeout_s=WAIT_S) == "the robot sends reports"
+        assert on_serial_port(line, FIRMWARE[robot], timeout_s=WAIT_S) == "the robot sends reports"
     else:
         with pytest.raises(DeviceError, match=f"no report from {robot} within 0.6 s; received b'"):
-            on_serial_port(line[0], FIRMWARE[robot], timeout_s=0.6)
+            on_serial_port(line, FIRMWARE[robot], timeout_s=0.6)
     timer.join()
+    os.close(master)
+    os.close(slave)

@@ -128,21 +128,15 @@ def temporary() -> Iterator[Path]:
         yield Path(folder)
 
 
-@pytest.fixture
-def _possible(section: Section) -> None:
-    """Skips what this machine cannot measure; asked for only when a test needs it."""
+@pytest.mark.alone
+@pytest.mark.thorough
+@pytest.mark.timeout(400)
+@pytest.mark.parametrize("section", SECTIONS, ids=lambda section: section.name)
+def test_a_quick_run_leaves_results_and_nothing_else(section: Section, temporary: Path, tmp_path: Path) -> None:
     if section.needs_root and (obstacle := why_no_namespaces()):
         pytest.skip(f"no namespaces: {obstacle}")
     if section.name == "traffic" and find_spec("duckdb") is None:
         pytest.skip("needs DuckDB")
-
-
-@pytest.mark.alone
-@pytest.mark.thorough
-@pytest.mark.timeout(400)
-@pytest.mark.usefixtures("_possible")
-@pytest.mark.parametrize("section", SECTIONS, ids=lambda section: section.name)
-def test_a_quick_run_leaves_results_and_nothing_else(section: Section, temporary: Path, tmp_path: Path) -> None:
     ended = subprocess.run(
         command(section.name, "--output", str(tmp_path)),
         env={**os.environ, "TMPDIR": str(temporary)}, cwd=ROOT, capture_output=True, text=True, check=False,

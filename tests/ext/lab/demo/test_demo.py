@@ -9,7 +9,7 @@ import ssl
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -51,23 +51,6 @@ def test_without_a_terminal_nothing_is_started(capsys: pytest.CaptureFixture[str
     assert capsys.readouterr().out == ""
 
 
-@pytest.fixture
-def phone(tmp_path: Path) -> Phone:
-    return Phone(tmp_path)
-
-
-@pytest.fixture
-def page(tmp_path: Path, phone: Phone) -> Iterator[PageServer]:
-    broker = Broker(tmp_path)
-    server = PageServer(tmp_path, broker.port, port=0, **phone.settings)
-    try:
-        server.wait()
-        yield server
-    finally:
-        end_all([server])
-        broker.stop()
-
-
 def login(url: str, password: str, authority: Path) -> int:
     """The status of the answer, of a browser that trusts the authority."""
     headers = {"Content-Type": "application/json", "Origin": url.rstrip("/")}
@@ -82,18 +65,24 @@ def login(url: str, password: str, authority: Path) -> int:
         return error.code
 
 
-def test_the_password_that_is_printed_opens_the_page(tmp_path: Path, phone: Phone, page: PageServer) -> None:
-    printed = Console(file=io.StringIO(), width=80, force_terminal=True)
-    phone.show(page.url, printed)
-    shown = printed.file.getvalue()  # type: ignore[attr-defined]
-    (password,) = re.findall(rf"Log in as {NAME} with the password (\S+)", shown)
-    authority = phone.settings["authority"]
-    port = page.url.rstrip("/").rpartition(":")[2]
-    for host in (page.url, f"https://localhost:{port}/"):
-        assert [login(host, one, authority) for one in (password, password[::-1])] == [200, 401]
-    stored = [file for file in tmp_path.rglob("*") if file.is_file() and password.encode() in file.read_bytes()]
-    assert stored == []
-    assert password not in Path(f"/proc/{page.pid}/cmdline").read_text()
+def test_the_password_that_is_printed_opens_the_page(tmp_path: Path, broker: Broker) -> None:
+    phone = Phone(tmp_path)
+    page = PageServer(tmp_path, broker.port, port=0, **phone.settings)
+    try:
+        page.wait()
+        printed = Console(file=io.StringIO(), width=80, force_terminal=True)
+        phone.show(page.url, printed)
+        shown = printed.file.getvalue()  # type: ignore[attr-defined]
+        (password,) = re.findall(rf"Log in as {NAME} with the password (\S+)", shown)
+        authority = phone.settings["authority"]
+        port = page.url.rstrip("/").rpartition(":")[2]
+        for host in (page.url, f"https://localhost:{port}/"):
+            assert [login(host, one, authority) for one in (password, password[::-1])] == [200, 401]
+        stored = [file for file in tmp_path.rglob("*") if file.is_file() and password.encode() in file.read_bytes()]
+        assert stored == []
+        assert password not in Path(f"/proc/{page.pid}/cmdline").read_text()
+    finally:
+        end_all([page])
 
 
 # -- the scripted operator
@@ -103,37 +92,23 @@ BASE = "pebble/robots/goob"
 ANNA = {"id": "3f2a91c0", "by": "anna", "for_ms": 10_000}
 
 
-@pytest.fixture
-def robot(broker: Broker) -> Iterator[RecordingRobot]:
-    with RecordingRobot(broker.port, BASE, keeps=True) as running:
-        yield running
-
-
-@pytest.fixture
-def operator(broker: Broker, robot: RecordingRobot) -> Iterator[Operator]:
-    running = Operator(broker.port)
-    running.connect()
-    assert until(lambda: running.not_ready(["goob"]) == [])
-    yield running
-    running.close()
-
-
-def test_a_robot_that_a_person_has_taken_is_left_alone_until_the_step_after(
-    robot: RecordingRobot, operator: Operator
-) -> None:
-    operator.begin()
-    assert until(lambda: robot.drives(0.0))
-    assert robot.keeping is not None
-    assert {drive.get("key") for drive in robot.drives()} == {robot.keeping.owners[0].lease.key}
-    robot.command(CONTROL_TAKE.metric, ANNA)
-    assert until(lambda: operator.activity.endswith("; goob is driven by anna"))
-    taken = time.monotonic()
-    assert not until(lambda: robot.drives(taken + 0.1), 1.0)
-    robot.command(CONTROL.metric, ANNA | {"want": "release"})
-    assert until(lambda: "goob" not in operator.activity)
-    assert until(lambda: robot.drives(taken + 0.1))
-    assert operator.visitors.left_alone == {"goob"}
-    assert [one for one in operator.completed if one.ended > taken > one.began] == []
+def test_a_robot_that_a_person_has_taken_is_left_alone_until_the_step_after(broker: Broker) -> None:
+    with RecordingRobot(broker.port, BASE, keeps=True) as robot, closing(Operator(broker.port)) as operator:
+        operator.connect()
+        assert until(lambda: operator.not_ready(["goob"]) == [])
+        operator.begin()
+        assert until(lambda: robot.drives(0.0))
+        assert robot.keeping is not None
+        assert {drive.get("key") for drive in robot.drives()} == {robot.keeping.owners[0].lease.key}
+        robot.command(CONTROL_TAKE.metric, ANNA)
+        assert until(lambda: operator.activity.endswith("; goob is driven by anna"))
+        taken = time.monotonic()
+        assert not until(lambda: robot.drives(taken + 0.1), 1.0)
+        robot.command(CONTROL.metric, ANNA | {"want": "release"})
+        assert until(lambda: "goob" not in operator.activity)
+        assert until(lambda: robot.drives(taken + 0.1))
+        assert operator.visitors.left_alone == {"goob"}
+        assert [one for one in operator.completed if one.ended > taken > one.began] == []
 
 
 # -- visitors
@@ -170,16 +145,12 @@ def test_a_command_that_the_operator_has_not_sent_is_another_drivers(received: l
 # -- the rig
 
 
-def write_when_ended(name: str, into: Path) -> list[str]:
-    """A program that appends its name to a file when it gets SIGTERM."""
-    return ["sh", "-c", f"trap 'echo {name} >> {into}; exit' TERM; touch {into}.{name}; while :; do sleep 0.01; done"]
-
-
 def test_operators_end_first_and_brokers_last(tmp_path: Path) -> None:
     order = tmp_path / "order"
     with Processes() as processes:
         for name, kind in (("broker", BROKERS), ("mcu", MCUS), ("robot", ROBOTS), ("operator", OPERATORS)):
-            processes.add(Program(name, write_when_ended(name, order), tmp_path / f"{name}.log"), kind)
+            trap = f"trap 'echo {name} >> {order}; exit' TERM; touch {order}.{name}; while :; do sleep 0.01; done"
+            processes.add(Program(name, ["sh", "-c", trap], tmp_path / f"{name}.log"), kind)
             assert until(Path(f"{order}.{name}").exists)
         assert processes.unexpected_exits() == []
     assert order.read_text().split() == ["operator", "robot", "mcu", "broker"]

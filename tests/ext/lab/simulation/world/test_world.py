@@ -98,13 +98,9 @@ CAMERAS = [
 ]
 
 
-def both_tags(**keys: Any) -> Any:
-    return world_of(tags=[TAG, {**TAG, "id": 4, "x": 2.02, "yaw_deg": 0.0}], **keys)
-
-
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_a_tag_is_where_the_pinhole_model_puts_it(camera: tuple[float, float, float]) -> None:
-    world = both_tags()
+    world = world_of(tags=[TAG, {**TAG, "id": 4, "x": 2.02, "yaw_deg": 0.0}])
     ((number, corners),) = tags_in(seen(world, size=(1280, 720), goob=camera)).items()
     assert np.abs(corners - projected(world, number, camera, (1280, 720))).max() < 1.0
 
