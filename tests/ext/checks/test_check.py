@@ -175,16 +175,12 @@ def places(tmp_path: Path) -> Iterator[Places]:
         yield one
 
 
-def parts(file: Path) -> dict[str, str]:
-    with zipfile.ZipFile(file) as packed:
-        return {name: packed.read(name).decode() for name in packed.namelist()}
-
-
 def test_what_is_in_it_and_what_is_not(places: Places, tmp_path: Path, run: Run) -> None:
     file = tmp_path / "goob.zip"
     assert run("doctor", "--report", file, "--root", places.root) == 0
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
-    found = parts(file)
+    with zipfile.ZipFile(file) as packed:
+        found = {name: packed.read(name).decode() for name in packed.namelist()}
     missing = {line.split(": ")[0] for line in found["index.txt"].splitlines() if ": MISSING: " in line}
     assert found.keys() | missing == {"index.txt", *report.PARTS}
     assert missing >= {"status.txt", "slots.txt"}  # it does not run, and has no slots

@@ -51,17 +51,13 @@ def test_a_number_that_may_change(tmp_path: Path, name: str, links: dict[str, st
             (tmp_path / f"{kind}{place}").touch()
     (tmp_path / name).touch()
     (tmp_path / "ttyACM7").unlink()
-    link(tmp_path, links)
+    for link, target in links.items():
+        path = tmp_path / "serial" / link
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.symlink_to(tmp_path / target)
     result = device(tmp_path / name, "it", KEY, tmp_path / "serial")
     assert result.state is (State.WARN if better else State.OK)
     assert result.fix == (f"set {KEY} to {tmp_path / 'serial' / better}" if better else "")
-
-
-def link(tmp_path: Path, links: dict[str, str]) -> None:
-    for name, target in links.items():
-        path = tmp_path / "serial" / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.symlink_to(tmp_path / target)
 
 
 @pytest.mark.parametrize(

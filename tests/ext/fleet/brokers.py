@@ -22,11 +22,7 @@ from pebble.transports.base import Message
 from tests.support import WAIT_S, Child, free_port, listening, until
 
 
-class BrokerError(Exception):
-    """The broker ends the connection, or does not answer in time."""
-
-
-class RefusedError(BrokerError):
+class RefusedError(Exception):
     """The broker does not let this account in."""
 
 
@@ -94,11 +90,11 @@ class BrokerClient:
         self.wait(lambda: not self._waiting, "acknowledge messages")
 
     def wait(self, condition: Callable[[], Any], what: str) -> None:
-        """Read until ``condition``. Raises BrokerError in time, and when the broker closes the connection."""
+        """Read until ``condition``. Fails in time, and when the broker closes the connection."""
         deadline = time.monotonic() + WAIT_S
         while not condition():
             if self.closed or time.monotonic() > deadline:
-                raise BrokerError(f"the broker {'closed the connection and ' * self.closed}did not {what}")
+                raise AssertionError(f"the broker {'closed the connection and ' * self.closed}did not {what}")
             self._read(0.05)
 
     def listen(self, seconds: float) -> None:

@@ -30,8 +30,7 @@ from pebble.extensions.fleet.robot_audit import ROBOT, files
 from pebble.extensions.fleet.robot_audit import Audit as RobotAudit
 from pebble.extensions.fleet.row_writer import DIFFERENT, OF_STRANGERS, WAITING, WINDOW_S, RowWriter
 from pebble.forwarding.routing import Drop
-from tests.commands.command_line import Run
-from tests.services.mqtt_bridge.bridge_rig import MemoryRig, make_config
+from tests.services.mqtt_bridge.bridge_rig import make_config
 from tests.support import WAIT_S, quickly, until
 
 
@@ -438,36 +437,3 @@ def test_half_a_line_is_left_to_itself(log: Log) -> None:
     lines = log.path.read_bytes().splitlines()
     assert lines[1] == b'{"t":4'
     assert json.loads(lines[2])["what"] == "stop"
-
-
-def test_a_bridge_notes_what_passes_and_a_command_prints_it(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    rig = MemoryRig(monkeypatch)
-    try:
-        rig.bridge()
-        path, older = files(make_config())
-        rig.remote.publish("incoming/estop", json.dumps({"stop": STOP, "by": "ann"}).encode())
-        rig.remote.publish("incoming/autonomy-command", b'{"action": "stop"}', retain=True)  # live, though retained
-        rig.local.publish("incoming/autonomy-command", b'{"action": "start", "file": "a"}')
-        assert until(lambda: path.exists() and path.read_bytes().count(b"\n") == 4), path.read_text()
-    finally:
-        rig.close()
-    with path.open("ab") as file:
-        file.write(b'{"t": "x"}\n\n[1]\n{"t":1e99}\n{"t":1,"what":"stop","count":9,"by":"\\u001b[2J"}\n')
-    older.write_bytes(b'{"t":0,"what":"first"}\n')
-    robot = tmp_path / "rover.json"
-    robot.write_text(json.dumps({"robot": {"id": "rover"}, "services": {}}))
-    pebble = Run(monkeypatch, capsys)
-    assert pebble("fleet", "audit", robot, columns=200) == 0
-    lines = [line.rstrip() for line in pebble.out.splitlines()]
-    assert [line.split()[2] for line in lines[1:3]] == ["first", "start"]
-    shown = [line.split()[2:] for line in lines[3:6]]  # of two connections
-    assert ["stop", "ann?", "operators", "stop", STOP] in shown
-    assert ["script-start", ROBOT, "robot", "file", "a"] in shown
-    assert {row[0] for row in shown} == {"stop", "script-start", "refused"}
-    assert "× 9" in lines[6]
-    assert lines[6].endswith(r"by \u001b[2J")
-    assert lines[8].startswith("3 lines cannot be read")
-    assert pebble("fleet", "audit", robot, "-n", "1") == 0
-    assert ("× 9" in pebble.out, pebble.out.count("\n")) == (True, 3)

@@ -197,17 +197,17 @@ def pictures(count: int, keyframe_interval: int = 10) -> list[bytes]:
     return payloads
 
 
-async def _feed(medium: str, payloads: list[bytes]) -> MediaFeed:
-    """Payloads that come while the conversion does not get on."""
-    broker = broker_on(MemoryHub())
-    feed = MediaFeed(broker, Server("test", lambda _topic, _on: None), Schemas(), ROBOT, medium)  # type: ignore[arg-type]
-    for payload in payloads:
-        feed.receive(payload)
-    return feed
-
-
 def feed(medium: str, payloads: list[bytes]) -> MediaFeed:
-    return asyncio.run(_feed(medium, payloads))
+    """Payloads that come while the conversion does not get on."""
+
+    async def fed() -> MediaFeed:
+        server = Server("test", lambda _topic, _on: None)
+        feed = MediaFeed(broker_on(MemoryHub()), server, Schemas(), ROBOT, medium)  # type: ignore[arg-type]
+        for payload in payloads:
+            feed.receive(payload)
+        return feed
+
+    return asyncio.run(fed())
 
 
 def test_the_oldest_is_dropped_for_the_newest() -> None:

@@ -289,7 +289,8 @@ class Passage:
         assert counted == self.counts["published"], "one is not counted"
 
 
-def perform(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("seed", range(cases(12, 1000)))
+def test_no_walk_violates_a_rule(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """A sieve with places for all topics, or for three of them; then what waits is sent, in one of two ways."""
     fair = seed % 3 > 0
     monkeypatch.setattr(module, "TOPICS", 512 if fair else 3)
@@ -297,8 +298,3 @@ def perform(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     for _ in range(400):
         walk.step()
     walk.end(at_once=seed % 2 > 0)
-
-
-@pytest.mark.parametrize("seed", range(cases(12, 1000)))
-def test_no_walk_violates_a_rule(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    perform(seed, monkeypatch)

@@ -291,18 +291,18 @@ def command(broker: Broker) -> Iterator[None]:
 def page(broker: Broker) -> Iterator[None]:
     loop = asyncio.new_event_loop()
     task = loop.create_task(expand(MqttSettings(host="127.0.0.1", port=broker.port)))
-    thread = threading.Thread(target=_run, args=(loop, task))
+
+    def run_it() -> None:
+        with suppress(asyncio.CancelledError):
+            loop.run_until_complete(task)
+
+    thread = threading.Thread(target=run_it)
     thread.start()
     try:
         yield
     finally:
         loop.call_soon_threadsafe(task.cancel)
         thread.join(WAIT_S)
-
-
-def _run(loop: asyncio.AbstractEventLoop, task: asyncio.Task[None]) -> None:
-    with suppress(asyncio.CancelledError):
-        loop.run_until_complete(task)
 
 
 @pytest.mark.parametrize("beside", [command, page])

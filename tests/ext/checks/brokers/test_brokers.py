@@ -275,7 +275,6 @@ def test_what_a_broker_forgets_at_a_restart_is_named(
 
 DOCUMENT = ROOT / "docs" / "brokers.md"
 MARKS = {State.OK: "yes", State.WARN: "limits", State.FAILED: "**no**", State.SKIPPED: "–"}
-_RECOMMENDED = ("set_tcp_nodelay true",)
 
 
 class Row(NamedTuple):
@@ -287,7 +286,7 @@ class Row(NamedTuple):
 
 
 BROKERS = {
-    "mosquitto": Row(lambda folder: Broker(folder, *_RECOMMENDED, persistence=True), lambda: False),
+    "mosquitto": Row(lambda folder: Broker(folder, "set_tcp_nodelay true", persistence=True), lambda: False),
     "mosquitto, plain": Row(Broker, lambda: False),
     "NATS": Row(MAKERS["nats"].make, MAKERS["nats"].missing, ("newest last",)),
     "RabbitMQ": Row(MAKERS["rabbitmq"].make, MAKERS["rabbitmq"].missing, ("newest last",)),
@@ -312,10 +311,6 @@ def judged(row: Row) -> dict[str, CheckResult]:
             broker.stop()
 
 
-def marks(findings: dict[str, CheckResult]) -> dict[str, str]:
-    return {name: MARKS[finding.state] for name, finding in findings.items()}
-
-
 def columns(text: str) -> dict[str, dict[str, str]]:
     """Return the marks in the first table of a document: by broker without its version, then by probe."""
     lines = text[text.index("\n| ") :].strip().partition("\n\n")[0].splitlines()
@@ -335,7 +330,7 @@ def columns(text: str) -> dict[str, dict[str, str]]:
 )
 def test_the_document_has_what_is_found(name: str) -> None:
     row, documented = BROKERS[name], columns(DOCUMENT.read_text())[name]
-    found = marks(judged(row))
+    found = {name: MARKS[finding.state] for name, finding in judged(row).items()}
     assert found == {**documented, **{probe: found[probe] for probe in row.varies}}
 
 

@@ -23,12 +23,14 @@ from pebble.extensions.fleet.folder import FLEET, ZENOH
 from pebble.extensions.fleet.hub_access import read_access
 from pebble.extensions.fleet.hub_file import load_hub
 from pebble.extensions.fleet.people import People
+from pebble.extensions.fleet.robot_audit import ROBOT, files
 from pebble.extensions.fleet.roles import Role
 from pebble.extensions.lab.rig.processes import python
 from pebble.extensions.operator.places import mosquitto_path
 from tests.commands.command_line import Run, running
 from tests.ext.fleet.brokers import BrokerClient, Place
 from tests.kit.terminal import Terminal
+from tests.services.mqtt_bridge.bridge_rig import MemoryRig, make_config
 from tests.support import ROOT, WAIT_S, Child, free_port, listening, until
 
 PAGE = (ROOT / "docs/ext/fleet.md").read_text()
@@ -262,6 +264,38 @@ def test_two_robots_of_a_lan_and_a_board_receive_each_other_in_six_commands(tmp_
             stack.enter_context(typed(line, tmp_path))
             assert until(lambda: listening(hub), 60), (tmp_path / "simulation.log").read_text()
         assert until(receives_both, 60), (tmp_path / "simulation.log").read_text()
+
+
+def test_a_bridge_notes_what_passes_and_a_command_prints_it(
+    monkeypatch: pytest.MonkeyPatch, run: Run, tmp_path: Path
+) -> None:
+    rig, stop = MemoryRig(monkeypatch), "0123456789abcdef"
+    try:
+        rig.bridge()
+        path, older = files(make_config())
+        rig.remote.publish("incoming/estop", json.dumps({"stop": stop, "by": "ann"}).encode())
+        rig.remote.publish("incoming/autonomy-command", b'{"action": "stop"}', retain=True)  # live, though retained
+        rig.local.publish("incoming/autonomy-command", b'{"action": "start", "file": "a"}')
+        assert until(lambda: path.exists() and path.read_bytes().count(b"\n") == 4), path.read_text()
+    finally:
+        rig.close()
+    with path.open("ab") as file:
+        file.write(b'{"t": "x"}\n\n[1]\n{"t":1e99}\n{"t":1,"what":"stop","count":9,"by":"\\u001b[2J"}\n')
+    older.write_bytes(b'{"t":0,"what":"first"}\n')
+    robot = tmp_path / "rover.json"
+    robot.write_text(json.dumps({"robot": {"id": "rover"}, "services": {}}))
+    assert run("fleet", "audit", robot, columns=200) == 0
+    lines = [line.rstrip() for line in run.out.splitlines()]
+    assert [line.split()[2] for line in lines[1:3]] == ["first", "start"]
+    shown = [line.split()[2:] for line in lines[3:6]]  # of two connections
+    assert ["stop", "ann?", "operators", "stop", stop] in shown
+    assert ["script-start", ROBOT, "robot", "file", "a"] in shown
+    assert {row[0] for row in shown} == {"stop", "script-start", "refused"}
+    assert "× 9" in lines[6]
+    assert lines[6].endswith(r"by \u001b[2J")
+    assert lines[8].startswith("3 lines cannot be read")
+    assert run("fleet", "audit", robot, "-n", "1") == 0
+    assert ("× 9" in run.out, run.out.count("\n")) == (True, 3)
 
 
 # -- files of gateways and hubs

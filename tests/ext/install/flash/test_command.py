@@ -11,7 +11,7 @@ import sys
 import threading
 import tty
 from binascii import crc_hqx
-from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -294,28 +294,19 @@ class UninterruptibleBoard:
             pass
 
 
-@pytest.fixture
-def uninterruptible() -> Iterator[UninterruptibleBoard]:
-    board = UninterruptibleBoard()
-    yield board
-    board.close()
-
-
-def test_the_user_is_asked_to_reset_a_board_that_does_not_listen(
-    uninterruptible: UninterruptibleBoard, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_user_is_asked_to_reset_a_board_that_does_not_listen(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ports, "_AUTOMATIC_S", 0.3)
-    ports.break_in(uninterruptible.port, uninterruptible.ask, pulse=True, timeout_s=WAIT_S)
-    assert len(uninterruptible.asked) == 1
-    assert "press its reset button" in uninterruptible.asked[0]
+    with closing(UninterruptibleBoard()) as board:
+        ports.break_in(board.port, board.ask, pulse=True, timeout_s=WAIT_S)
+    assert len(board.asked) == 1
+    assert "press its reset button" in board.asked[0]
 
 
-def test_a_board_without_micropython_is_an_error(
-    uninterruptible: UninterruptibleBoard, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_board_without_micropython_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ports, "_AUTOMATIC_S", 0.1)
-    with pytest.raises(DeviceError, match=r"MicroPython does not answer; .* --micropython"):
-        ports.break_in(uninterruptible.port, lambda _: None, pulse=False, timeout_s=0.5)
+    unanswered = pytest.raises(DeviceError, match=r"MicroPython does not answer; .* --micropython")
+    with closing(UninterruptibleBoard()) as board, unanswered:
+        ports.break_in(board.port, lambda _: None, pulse=False, timeout_s=0.5)
 
 
 def test_a_missing_port_lists_the_available_ones(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

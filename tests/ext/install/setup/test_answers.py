@@ -27,14 +27,10 @@ from tests.kit.terminal import Terminal
 from tests.support import beside
 
 
-def without(key: str) -> dict[str, Any]:
-    return {name: value for name, value in ANSWERS.items() if name != key}
-
-
 @pytest.mark.parametrize(
     ("given", "keys"),
     [
-        *((without(key), [key]) for key in ("protocol", "user")),
+        *(({name: ANSWERS[name] for name in ANSWERS if name != key}, [key]) for key in ("protocol", "user")),
         (ANSWERS | {"broker": "broker.lab"}, ["broker_user", "broker_password_file"]),
         ({}, ["id", "port", "camera", "broker", "page"]),
     ],

@@ -10,7 +10,7 @@ import subprocess
 import tarfile
 import threading
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +43,7 @@ from tests.ext.install.setup.conftest import (
 )
 from tests.support import Child, beside, free_port, listening, needs_root, until
 
-HEAD = ("backup.json", b'{"format": 1, "version": "0", "id": "a"}')
+HEAD = (ABOUT, b'{"format": 1, "version": "0", "id": "a"}')
 GOOB, FRED = Identity("pebble", "robots", "goob"), Identity("pebble", "robots", "fred")
 
 
@@ -333,20 +333,19 @@ def test_nothing_is_left_of_one_that_cannot_be_made(tmp_path: Path, run: Run, mo
     assert not file.exists()
 
 
-ABOUT_IT = (ABOUT, b'{"format": 1, "version": "0.1", "id": "goob"}')
 FOREIGN: dict[str, tuple[bytes, str]] = {
     "empty": (b"", "is no backup of Pebble"),
     "a picture": (b"\xff\xd8\xff" * 5000, "is no backup of Pebble"),
     "another tar": (tar_of(("etc/passwd", b"x")), "does not begin with backup.json"),
     "no id": (tar_of((ABOUT, b'{"format": 1, "version": "0.1"}')), "is not of a backup"),
     "a later format": (tar_of((ABOUT, b'{"format": 2, "version": "0.9", "id": "x"}')), "of Pebble 0.9: update Pebble"),
-    "absolute": (tar_of(ABOUT_IT, ("/etc/shadow", b"x")), "'/etc/shadow' is not what a backup has"),
-    "beyond the root": (tar_of(ABOUT_IT, ("etc/../../x", b"x")), "is not what a backup has"),
-    "a link": (tar_of(ABOUT_IT, ("etc/x", b""), kind=tarfile.SYMTYPE), "is not what a backup has"),
-    "a hole": (tar_of(ABOUT_IT, ("etc/x", b""), kind=tarfile.GNUTYPE_SPARSE), "is not what a backup has"),
-    "a device": (tar_of(ABOUT_IT, ("etc/x", b""), kind=tarfile.CHRTYPE), "is not what a backup has"),
-    "a broken name": (tar_of(ABOUT_IT, ("etc/./x", b"x")), "is not what a backup has"),
-    "twice": (tar_of(ABOUT_IT, ("etc/x", b"1"), ("etc/x", b"2")), "is in it twice"),
+    "absolute": (tar_of(HEAD, ("/etc/shadow", b"x")), "'/etc/shadow' is not what a backup has"),
+    "beyond the root": (tar_of(HEAD, ("etc/../../x", b"x")), "is not what a backup has"),
+    "a link": (tar_of(HEAD, ("etc/x", b""), kind=tarfile.SYMTYPE), "is not what a backup has"),
+    "a hole": (tar_of(HEAD, ("etc/x", b""), kind=tarfile.GNUTYPE_SPARSE), "is not what a backup has"),
+    "a device": (tar_of(HEAD, ("etc/x", b""), kind=tarfile.CHRTYPE), "is not what a backup has"),
+    "a broken name": (tar_of(HEAD, ("etc/./x", b"x")), "is not what a backup has"),
+    "twice": (tar_of(HEAD, ("etc/x", b"1"), ("etc/x", b"2")), "is in it twice"),
 }
 
 
@@ -368,11 +367,5 @@ def test_a_torn_or_damaged_one_is_never_taken_for_whole(places: Places) -> None:
             unpacked(whole[:cut], "x.tar")
     for place in range(600, end, 401):
         damaged = whole[:place] + bytes([whole[place] ^ 0x5A]) + whole[place + 1 :]
-        assert _files_of(damaged) in (None, wanted), place  # a header has fields that mean nothing here
-
-
-def _files_of(raw: bytes) -> Any:
-    try:
-        return unpacked(raw, "x.tar").files
-    except BackupError:
-        return None
+        with suppress(BackupError):  # a header has fields that mean nothing here
+            assert unpacked(damaged, "x.tar").files == wanted, place

@@ -130,9 +130,8 @@ _QUEUED = 1000  # mosquitto's max_queued_messages
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A message of an operator: when it was published, whether it is retained, and when it left the broker's queue."""
+    """A message of an operator, whether it is retained, and when it left the broker's queue."""
 
-    sent_at: float
     payload: bytes
     retained: bool
     topic: str
@@ -207,7 +206,7 @@ class VirtualBroker:
         self.route(Publish(topic, payload, qos, retain))
 
     def route(self, message: Publish) -> None:
-        command = Command(self.now(), message.payload, retained=False, topic=message.topic)
+        command = Command(message.payload, retained=False, topic=message.topic)
         if self.frozen:
             self._backlog.append((message, command))
         elif self.running:
@@ -353,7 +352,7 @@ class Session:
         for topic, qos in wanted:
             for retained in [one for one in self._broker.retained.values() if matches(topic, one.topic)]:
                 copy = replace(retained, qos=min(qos, retained.qos), retain=True)
-                self._deliver(copy, Command(self._broker.now(), retained.payload, retained=True, topic=retained.topic))
+                self._deliver(copy, Command(retained.payload, retained=True, topic=retained.topic))
 
     def _acknowledged(self, number: int) -> None:
         if number not in self._in_flight:

@@ -241,14 +241,11 @@ class VirtualNetwork:
     def ask(self, place: Address, data: bytes) -> bytes | None:
         """What a server at ``place`` answers to a datagram."""
         if place in NAME_SERVERS:
-            return self._spoilt(self.conditions.dns, self._names(data))
+            known = {} if self.conditions.dns == "no such name" else self.hosts
+            return self._spoilt(self.conditions.dns, name_answer(data, known.get))
         if place[1] == TIME_PORT:
             return self._spoilt(self.conditions.ntp, time_answer(data, EPOCH_S + self.clock.now()))
         return None
-
-    def _names(self, query: bytes) -> bytes | None:
-        known = {} if self.conditions.dns == "no such name" else self.hosts
-        return name_answer(query, known.get)
 
     @staticmethod
     def _spoilt(how: str, answer: bytes | None) -> bytes | None:
