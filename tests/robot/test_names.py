@@ -13,8 +13,7 @@ from typing import Any
 
 import pytest
 
-from tests.ext.fleet.broker_client import BrokerClient, Place
-from tests.ext.fleet.brokers import HOST
+from tests.ext.fleet.brokers import HOST, BrokerClient, Place
 from tests.robot.named import DRIVE, Hall, Named
 from tests.robot.operator import driving
 from tests.robot.rig import BASE, STOP, lines

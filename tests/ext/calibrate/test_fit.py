@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -133,26 +134,19 @@ def test_a_folder_of_pictures_gives_a_file_that_opencv_and_ours_read(
     assert said.splitlines()[-1].endswith("a tape from the lens to it reads 1.00 m")
 
 
-class Quiet:
-    """A person to whom nothing is told."""
-
-    def tell(self, line: str) -> None:
-        pass
-
-    def ask(self, question: str) -> str:
-        raise AssertionError
+QUIET = Mock(spec=["tell"])  # a person who is asked nothing
 
 
 def test_of_a_camera_pictures_of_a_tag_at_rest_count_alone(pictures: Path) -> None:
     shown = list(itertools.islice(read_folder(pictures), 4))
     moving = [picture for picture in shown for _ in range(2)]
     resting = [picture for picture in shown for _ in range(5)]
-    assert collect(moving, TagFinder(), 13, Quiet(), still=False)[0] == []
-    assert len(collect(resting, TagFinder(), 13, Quiet(), still=False)[0]) == 4
+    assert collect(moving, TagFinder(), 13, QUIET, still=False)[0] == []
+    assert len(collect(resting, TagFinder(), 13, QUIET, still=False)[0]) == 4
 
 
 def test_what_cannot_be_measured_is_refused_and_not_written(pictures: Path, tmp_path: Path) -> None:
-    corners, _ = collect(read_folder(pictures), TagFinder(), 13, Quiet(), still=True)
+    corners, _ = collect(read_folder(pictures), TagFinder(), 13, QUIET, still=True)
     with pytest.raises(PebbleError, match="14 pictures of the tag in different places: 15 are needed"):
         solve(corners[:14], SIZE, 0.25)
     few = tmp_path / "few"

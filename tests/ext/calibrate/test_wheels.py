@@ -8,8 +8,8 @@ import random
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from collections.abc import Callable
+from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from pebble.extensions.scripts.perception.tags import Place, Tag
 from tests.ext.scripts.perception.test_odometry import powers, touches, turning
 from tests.ext.scripts.script.station import Station
 from tests.ext.scripts.shipped.test_processes import Sensors
-from tests.support import WAIT_S, Child, cases, some, until
+from tests.support import WAIT_S, Child, beside, cases, some, until
 
 TRUE = Wheels(61.0 * 1.01, 61.0 * 0.99, 130.5 * 1.03)
 ROOM = {"x_min": -0.5, "x_max": 2.4, "y_min": -2.0, "y_max": 2.0}
@@ -195,10 +195,6 @@ def hide(_robot: Measured) -> None:
     Finder.hidden = True
 
 
-def nearer(robot: Measured) -> None:
-    robot.body.place(1.95, 0.0, 0.0)
-
-
 def hold(*wheels: int) -> Callable[[Measured], None]:
     """Return what keeps these wheels from turning."""
 
@@ -209,18 +205,18 @@ def hold(*wheels: int) -> Callable[[Measured], None]:
     return held
 
 
-def drive_by_hand(robot: Measured) -> None:
-    robot.receive(DRIVE, Drive(z=-0.1))
-
-
 @pytest.mark.parametrize(
     ("truth", "trouble", "said"),
     [
         ("tag", hide, "1 of 6, straight there: it has lost tag 13"),
-        ("tag", nearer, "1 of 6, straight there: the tag is nearer than 0.4 m"),
+        ("tag", lambda robot: robot.body.place(1.95, 0.0, 0.0), "1 of 6, straight there: the tag is nearer than 0.4 m"),
         ("tape", hold(0, 1), "1 of 6, straight there: it is not at its end after .* is it slower than --speed says"),
         ("tape", hold(1), r"1 of 6, straight there: a wheel has turned \d+ of 300 mm: does the other one turn"),
-        ("tape", drive_by_hand, "1 of 6, straight there: it is not obeyed: a person drives"),
+        (
+            "tape",
+            lambda robot: robot.receive(DRIVE, Drive(z=-0.1)),
+            "1 of 6, straight there: it is not obeyed: a person",
+        ),
         ("gyro", hide, "no inertial sensor that agrees with the wheels"),
     ],
 )
@@ -292,33 +288,20 @@ def test_without_hall_sensors_the_key_is_named(tmp_path: Path, monkeypatch: pyte
     assert [path.name for path in tmp_path.iterdir()] == ["room.json"]
 
 
-@pytest.fixture
-def sensors() -> Iterator[Sensors]:
-    station = Station("zenoh")
-    sensors = Sensors(station)
-    yield sensors
-    sensors.close()
-    station.close()
-
-
-def test_an_emergency_stop_ends_it_and_nothing_is_written(sensors: Sensors) -> None:
-    station, ended = sensors.station, threading.Event()
-    rolling = threading.Thread(target=lambda: [sensors.roll(0.2, 0.0) for _ in iter(ended.is_set, True)])
-    rolling.start()
-    command = ["calibrate", "wheels", str(station.config_path), "--truth", "tag", "--length", "0.3"]
-    try:
-        program = Child(
-            [sys.executable, "-m", "pebble.cli", *command],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-        )  # fmt: skip
-        assert until(lambda: station.moves(), 60), program.communicate(timeout=WAIT_S)[0]
-        station.publish_state(latched=True, count=1, by="ann")
-        assert until(station.rests)
-        said = program.communicate(timeout=WAIT_S)[0]
-    finally:
-        ended.set()
-        rolling.join(WAIT_S)
-    assert program.returncode == 3, said
-    assert "emergency stop by ann" in said
-    assert said.splitlines()[-1] == "pebble: ended; nothing was written"
-    assert not (station.folder / "odometry.json").exists()
+def test_an_emergency_stop_ends_it_and_nothing_is_written() -> None:
+    ended = threading.Event()
+    with closing(Station("zenoh")) as station, closing(Sensors(station)) as sensors:
+        command = ["calibrate", "wheels", str(station.config_path), "--truth", "tag", "--length", "0.3"]
+        with beside(lambda: [sensors.roll(0.2, 0.0) for _ in iter(ended.is_set, True)], ended):
+            program = Child(
+                [sys.executable, "-m", "pebble.cli", *command],
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+            )  # fmt: skip
+            assert until(lambda: station.moves(), 60), program.communicate(timeout=WAIT_S)[0]
+            station.publish_state(latched=True, count=1, by="ann")
+            assert until(station.rests)
+            said = program.communicate(timeout=WAIT_S)[0]
+        assert program.returncode == 3, said
+        assert "emergency stop by ann" in said
+        assert said.splitlines()[-1] == "pebble: ended; nothing was written"
+        assert not (station.folder / "odometry.json").exists()

@@ -63,10 +63,16 @@ def installed(root: Path) -> Iterator[Places]:
     _write(places.config, json.dumps(CONFIG))
     _write(places.state / "recordings/1.mcap", "large")
     certificates.init(places.etc / "tls", ["goob.local"])
-    _accounts(root / BROKER)
+    fleet = Fleet(level="named", brokers=(Server(host="127.0.0.1"),))
+    fleet = fleet.with_account("goob", Account(roles=("robot",), bases=("pebble/robots/goob",)))
+    applying.make(root / BROKER, fleet, {"goob": ROBOT})
     _write(places.broker, conf_text(load_fleet(root / BROKER), Path("/", BROKER), "mosquitto"))
     _calibrations(places.etc)
-    _stop(places)
+    latch = Latch("boot", 8, int.__sub__)
+    latch.stop(STOP, "ann", "a dog", 1)
+    stop = StateFile(config_of(places).state_file("estop-serial"))
+    stop.save(latch.saved())
+    stop.close()
     people = People(root / PEOPLE)
     people.add("ann", PAGE, Role.ADMIN)
     try:
@@ -84,12 +90,6 @@ def _write(file: Path, text: str) -> None:
     file.chmod(0o640)
 
 
-def _accounts(folder: Path) -> None:
-    fleet = Fleet(level="named", brokers=(Server(host="127.0.0.1"),))
-    fleet = fleet.with_account("goob", Account(roles=("robot",), bases=("pebble/robots/goob",)))
-    applying.make(folder, fleet, {"goob": ROBOT})
-
-
 def _calibrations(folder: Path) -> None:
     file = cv2.FileStorage(str(folder / "camera_calibration.yaml"), cv2.FILE_STORAGE_WRITE)
     file.write("camera_matrix", np.array([[618.9, 0, 320], [0, 618.9, 240], [0, 0, 1.0]]))
@@ -98,11 +98,3 @@ def _calibrations(folder: Path) -> None:
     file.write("image_height", 480)
     file.release()
     _write(folder / "auto_tune_state.json", json.dumps({"current_values": {"left_mm_per_event": 19.1}}))
-
-
-def _stop(places: Places) -> None:
-    latch = Latch("boot", 8, int.__sub__)
-    latch.stop(STOP, "ann", "a dog", 1)
-    file = StateFile(config_of(places).state_file("estop-serial"))
-    file.save(latch.saved())
-    file.close()

@@ -36,17 +36,14 @@ ESTOP, PATIENCE_S = "outgoing/estop/serial", 20.0
 NOT_HERE = {"unit": "skipped", "slot": "skipped"}
 
 
-def page(folder: Path) -> dict[str, Any]:
-    certificates.init(folder, ["robot.local"])
-    files = {"certificate": folder / "server.pem", "key": folder / "server.key", "ca": folder / "ca.pem"}
-    return {"web_interface": {"port": free_port(), "tls": {name: str(file) for name, file in files.items()}}}
-
-
 @pytest.fixture(scope="module", params=["mqtt", further("zenoh")])
 def rig(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
     """A robot with everything, and a page by https."""
     folder = tmp_path_factory.mktemp("tls")
-    with Rig(request.param, av_daemon=DEVICES, top=page(folder), web_handler={"enabled": True}, start=False) as one:
+    certificates.init(folder, ["robot.local"])
+    files = {"certificate": folder / "server.pem", "key": folder / "server.key", "ca": folder / "ca.pem"}
+    page = {"web_interface": {"port": free_port(), "tls": {name: str(file) for name, file in files.items()}}}
+    with Rig(request.param, av_daemon=DEVICES, top=page, web_handler={"enabled": True}, start=False) as one:
         people = one.folder / "password"
         people.write_text("a good password\n")
         command = [sys.executable, "-m", "pebble.cli", "web", "user", "add", "ann", "--config", str(one.config)]

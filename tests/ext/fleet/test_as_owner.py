@@ -219,10 +219,9 @@ def copy(theirs: Path, _: Path) -> object:
     return f"belongs to user {owner}" if owner else "a link in its place would lead root"
 
 
-ACTS = [password, answers, robot, script, report, container, everybody, world, holes, lines, copy]
-
-
-@pytest.mark.parametrize("act", ACTS)
+@pytest.mark.parametrize(
+    "act", [password, answers, robot, script, report, container, everybody, world, holes, lines, copy]
+)
 def test_what_a_user_names_root_neither_reads_nor_runs(
     act: Callable[[Path, Path], object], place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -15,8 +15,7 @@ from pebble.extensions.fleet.roles import ROLES, WRITES, Account
 from pebble.extensions.thin.expander import is_stream
 from pebble.transports.base import Message, QoS
 from pebble.transports.topics import matches
-from tests.ext.fleet.broker_client import BrokerClient, Place, RefusedError
-from tests.ext.fleet.brokers import HOST, FleetBroker
+from tests.ext.fleet.brokers import HOST, BrokerClient, FleetBroker, Place, RefusedError
 from tests.support import ROOT, free_port, until
 
 GOOB, FRED, LAMP = "pebble/robots/goob", "pebble/robots/fred", "pebble/lamps/lamp"

@@ -90,6 +90,12 @@ class Hall(Gateways):
         self.operator.publish(DRIVE.topic(ROBOT), command, qos=QoS.DELIVERED)
         return until(lambda: len(self.received) > before, 0.25)
 
+    def is_stopped_at_once(self) -> None:
+        stopped = time.monotonic()
+        self.operator.publish(ESTOP.topic(ROBOT), b'{"stop": "0123456789abcdef"}', qos=QoS.DELIVERED, urgent=True)
+        assert until(lambda: self.stops)
+        assert self.stops[0] - stopped <= STOP_S
+
     def _on_drive(self, message: Message) -> None:
         if message.payload.strip():  # else a probe for cycles
             self.received.append(json.loads(message.payload)["n"])
@@ -111,10 +117,7 @@ def test_a_second_one_does_not_start_and_takes_over_where_it_is_tried_again(hall
     hall.gateway.wait(WAIT_S)
     hall.gate("gate-2")
     assert until(hall.drives)
-    stopped = time.monotonic()
-    hall.operator.publish(ESTOP.topic(ROBOT), b'{"stop": "0123456789abcdef"}', qos=QoS.DELIVERED, urgent=True)
-    assert until(lambda: hall.stops)
-    assert hall.stops[0] - stopped <= STOP_S
+    hall.is_stopped_at_once()
     again = hall.gate("gate-1")
     assert until(lambda: hall.drives() and again.poll() == 1)
     assert hall.received == sorted(set(hall.received)), "none came twice, or after a newer one"
@@ -133,10 +136,7 @@ def test_what_waited_for_a_gateway_that_stood_still_is_too_old(hall: Hall) -> No
     assert until(hall.drives)
     assert old
     assert not old & {*hall.received}
-    stopped = time.monotonic()
-    hall.operator.publish(ESTOP.topic(ROBOT), b'{"stop": "0123456789abcdef"}', qos=QoS.DELIVERED, urgent=True)
-    assert until(lambda: hall.stops)
-    assert hall.stops[0] - stopped <= STOP_S
+    hall.is_stopped_at_once()
 
 
 LAMP = "pebble/robots/minilamp"

@@ -245,13 +245,6 @@ def test_the_file_is_for_its_owner_and_holds_no_password_and_no_token(tmp_path: 
     assert hashed == hashlib.scrypt(PASSWORD.encode(), salt=salt, n=2**14, r=8, p=1)
 
 
-def test_settings(people: People) -> None:
-    assert people.get("estop") == ""
-    people.set("estop", "a")
-    people.set("estop", "b")
-    assert people.get("estop") == "b"
-
-
 def test_a_file_that_is_no_database(tmp_path: Path) -> None:
     file = tmp_path / "people.sqlite"
     file.write_text("no database, but long enough to be read as one" * 10)

@@ -42,35 +42,24 @@ def test_what_must_outlive_a_container_is_on_a_volume() -> None:
     assert robot["group_add"] == ["dialout", "video", "audio"]
 
 
-@pytest.fixture
-def container(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The state directory of a faked container; its parent is a mount."""
-    monkeypatch.setenv("PEBBLE_CONTAINER", "1")
-    monkeypatch.setattr(Path, "is_mount", lambda path: path in (tmp_path, Path("/")))
-    return tmp_path / "state"
-
-
 @pytest.mark.parametrize("volume", [True, False])
 def test_a_stop_in_a_container_is_saved_on_a_volume_only(
-    container: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, volume: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, volume: bool
 ) -> None:
-    monkeypatch.setattr(state_file, "LOST", ("/", *([] if volume else [str(container.parent)])))
+    """A faked container: the parent of its state directory is a mount."""
+    monkeypatch.setenv("PEBBLE_CONTAINER", "1")
+    monkeypatch.setattr(Path, "is_mount", lambda path: path in (tmp_path, Path("/")))
+    monkeypatch.setattr(state_file, "LOST", ("/", *([] if volume else [str(tmp_path)])))
     results: list[bool] = []
-    file = StateFile(container / "estop.json", lambda _, succeeded: results.append(succeeded))
+    file = StateFile(tmp_path / "state/estop.json", lambda _, succeeded: results.append(succeeded))
     assert file.can_save()
     file.save({"latched": True})
     assert until(lambda: results == [volume])
     file.close()
     assert ("NOT SAVED: no volume holds" in caplog.text) is not volume
-    lines = [line for _, line in facts(_config(container)).table]
+    transport = {"kind": "zenoh", "state_dir": str(tmp_path / "state")}
+    serial = {"serial_mcu_bridge": {"enabled": True, "serial": {"port": "/dev/ttyACM0"}}}
+    config = parse({"robot": {"id": "goob"}, "transport": transport, "services": serial}, folder=tmp_path, env={})
+    lines = [line for _, line in facts(config).table]
     assert ("NOT SAVED" in lines[0]) is not volume
     assert any("/dev/serial/by-id" in line for line in lines)
-
-
-def _config(state: Path) -> Any:
-    serial = {"serial_mcu_bridge": {"enabled": True, "serial": {"port": "/dev/ttyACM0"}}}
-    return parse(
-        {"robot": {"id": "goob"}, "transport": {"kind": "zenoh", "state_dir": str(state)}, "services": serial},
-        folder=state,
-        env={},
-    )

@@ -15,8 +15,7 @@ import yaml
 
 from pebble.extensions.metrics import robots as r
 from pebble.transports import MqttSettings, create
-from tests.ext.metrics.scrape import exporter
-from tests.ext.metrics.test_metrics import FOLDER, media, status
+from tests.ext.metrics.test_metrics import FOLDER, exporter, media, status
 from tests.kit.played_robot import RecordingRobot
 from tests.support import WAIT_S, Broker, Child, free_port, until
 

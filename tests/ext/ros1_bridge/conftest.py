@@ -92,9 +92,6 @@ class World:
         """Return what the lock was set to."""
         return [words[0] for _, _, words in self.rows(since, "estop")]
 
-    def close(self) -> None:
-        self.ends.close()
-
 
 class Husky:
     """A robot with the bridge, on a thread of this process; ``world`` is its operator."""
@@ -170,7 +167,7 @@ def ros(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[World]:
     world.start_master()
     world.start_base()
     yield world
-    world.close()
+    world.ends.close()
 
 
 @pytest.fixture

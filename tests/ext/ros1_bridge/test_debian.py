@@ -58,4 +58,4 @@ def test_nodes_of_roscpp_hear_and_are_heard(tmp_path: Path) -> None:
     assert until(lambda: debian.zeros(begin + 500_000_000))
     assert husky.world.newest("wheel-odometry")["value"]["y_mm"] == 500.0
     husky.end()
-    debian.close()
+    debian.ends.close()

@@ -28,10 +28,6 @@ def node_of(ros: World, name: str = "pebble_ros1_bridge") -> Node:
     return Node(name, ros.uri, "127.0.0.1", lambda _why: None)
 
 
-def registered(node: Node) -> bool:
-    return until(lambda: node.registered)
-
-
 def test_a_command_becomes_a_twist_and_ends_in_zeros_then_silence(
     husky: Husky, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -236,7 +232,7 @@ def test_of_two_bridges_with_one_name_the_second_waits(husky: Husky, caplog: pyt
     assert not second.registered
     assert "has ended this node" not in caplog.text
     husky.end()
-    assert registered(second), "its name is free"
+    assert until(lambda: second.registered), "its name is free"
     second.close()
     husky.start()
 
@@ -298,7 +294,7 @@ def test_strangers_are_bounded_and_keep_nobody_out(husky: Husky) -> None:
         assert sock.recv(1) == b""
     for sock in callers:
         sock.close()
-    assert until(lambda: registered(node) and call(node.uri, "getPid", "/x"))
+    assert until(lambda: node.registered and call(node.uri, "getPid", "/x"))
     for greeting, answer in ((b"\x10\x00\x00\x00\x0c\x00\x00\x00topic=/other", b"error="), (b"\xff\xff\xff\xff", b"")):
         with socket.create_connection(("127.0.0.1", port)) as sock:
             sock.settimeout(WAIT_S)

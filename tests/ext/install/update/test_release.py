@@ -92,19 +92,12 @@ def test_the_command_names_the_reason(tmp_path: Path, capsys: pytest.CaptureFixt
     assert capsys.readouterr().err == "pebble: refused: release 0.3.0 is number 12, and number 12 was taken here\n"
 
 
-@pytest.fixture
-def minisign() -> str:
-    found = shutil.which("minisign")
-    if found is None:
-        pytest.skip("needs minisign (apt install minisign)")
-    return found
-
-
-def test_minisign_accepts_what_we_accept_and_signs_what_we_accept(tmp_path: Path, minisign: str) -> None:
+@pytest.mark.skipif(shutil.which("minisign") is None, reason="needs minisign (apt install minisign)")
+def test_minisign_accepts_what_we_accept_and_signs_what_we_accept(tmp_path: Path) -> None:
     folder = release(tmp_path / "r", OURS)
     manifest = str(folder / MANIFEST)
-    subprocess.run([minisign, "-V", "-P", OURS.public, "-m", manifest], check=True, capture_output=True)
+    subprocess.run(["minisign", "-V", "-P", OURS.public, "-m", manifest], check=True, capture_output=True)
     public, secret = tmp_path / "p", tmp_path / "s"
-    subprocess.run([minisign, "-G", "-W", "-p", str(public), "-s", str(secret)], check=True, capture_output=True)
-    subprocess.run([minisign, "-S", "-s", str(secret), "-m", manifest], check=True, capture_output=True, input=b"")
+    subprocess.run(["minisign", "-G", "-W", "-p", str(public), "-s", str(secret)], check=True, capture_output=True)
+    subprocess.run(["minisign", "-S", "-s", str(secret), "-m", manifest], check=True, capture_output=True, input=b"")
     assert verify(folder, [public.read_text().splitlines()[1]]).sequence == 12

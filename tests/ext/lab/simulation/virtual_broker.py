@@ -13,7 +13,116 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from pebble.transports.topics import matches
-from tests.ext.lab.simulation import virtual_mqtt as mqtt
+from tests.kit import mqtt_bytes
+
+CONNECT, CONNACK, PUBLISH, PUBACK, SUBSCRIBE, SUBACK, PINGREQ, PINGRESP, DISCONNECT = 1, 2, 3, 4, 8, 9, 12, 13, 14
+
+_CLIENT_FLAGS = {CONNECT: 0, PUBACK: 0, SUBSCRIBE: 2, PINGREQ: 0, DISCONNECT: 0}  # the low half of the first byte
+
+
+class MqttError(Exception):
+    """A client broke the protocol: a broker closes its connection."""
+
+
+@dataclass(frozen=True, slots=True)
+class Publish:
+    topic: str
+    payload: bytes
+    qos: int = 0
+    retain: bool = False
+    packet_id: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Connect:
+    client_id: str
+    keepalive_s: int
+    will: Publish | None
+
+
+def split(buffer: bytearray) -> tuple[int, int, bytes] | None:
+    """Take the first packet out of ``buffer``: its type, flags and body; None while it is not complete."""
+    length, shift, at = 0, 0, 1
+    while True:
+        if at >= len(buffer):
+            return None
+        length |= (buffer[at] & 0x7F) << shift
+        at, shift = at + 1, shift + 7
+        if not buffer[at - 1] & 0x80:
+            break
+        if shift > 21:
+            raise MqttError("a length of more than four bytes")
+    if len(buffer) < at + length:
+        return None
+    kind, flags, body = buffer[0] >> 4, buffer[0] & 0x0F, bytes(buffer[at : at + length])
+    del buffer[: at + length]
+    if flags != _CLIENT_FLAGS.get(kind, flags) or (kind not in _CLIENT_FLAGS and kind != PUBLISH):
+        raise MqttError(f"no packet of a client: type {kind}, flags {flags}")
+    return kind, flags, body
+
+
+def packet(kind: int, body: bytes = b"", flags: int = 0) -> bytes:
+    return mqtt_bytes.packet(kind << 4 | flags, body)
+
+
+def published(message: Publish) -> bytes:
+    return mqtt_bytes.publish(message.topic, message.payload, message.qos, message.packet_id, retain=message.retain)
+
+
+def read_publish(flags: int, body: bytes) -> Publish:
+    qos = flags >> 1 & 3
+    topic, at = _text(body, 0)
+    number = 0
+    if qos:
+        (number,) = struct.unpack_from("!H", body, at)
+        at += 2
+    if qos > 1 or (qos and not number) or not topic or "+" in topic or "#" in topic:
+        raise MqttError(f"a publish to {topic!r} with QoS {qos} and number {number}")
+    return Publish(topic, body[at:], qos, bool(flags & 1), number)
+
+
+def read_connect(body: bytes) -> Connect:
+    name, at = _text(body, 0)
+    level, flags, keepalive = struct.unpack_from("!BBH", body, at)
+    if (name, level) != ("MQTT", 4) or flags & 1:
+        raise MqttError(f"not MQTT 3.1.1: {name} {level}")
+    client_id, at = _text(body, at + 4)
+    will = None
+    if flags & 4:
+        topic, at = _text(body, at)
+        payload, at = _bytes(body, at)
+        will = Publish(topic, payload, flags >> 3 & 3, bool(flags & 0x20))
+    for flag in (0x80, 0x40):  # a user name, a password
+        if flags & flag:
+            _, at = _bytes(body, at)
+    if at != len(body):
+        raise MqttError("a CONNECT with something behind it")
+    return Connect(client_id, keepalive, will)
+
+
+def read_subscribe(body: bytes) -> tuple[int, list[tuple[str, int]]]:
+    (number,) = struct.unpack_from("!H", body, 0)
+    at, wanted = 2, []
+    while at < len(body):
+        topic, at = _text(body, at)
+        wanted.append((topic, body[at]))
+        at += 1
+    if not number or not wanted or any(qos > 2 for _, qos in wanted):
+        raise MqttError("a SUBSCRIBE without number or topics")
+    return number, wanted
+
+
+def _bytes(body: bytes, at: int) -> tuple[bytes, int]:
+    (length,) = struct.unpack_from("!H", body, at)
+    if at + 2 + length > len(body):
+        raise MqttError("a string that is longer than its packet")
+    return body[at + 2 : at + 2 + length], at + 2 + length
+
+
+def _text(body: bytes, at: int) -> tuple[str, int]:
+    raw, at = _bytes(body, at)
+    return raw.decode(), at
+
 
 _IN_FLIGHT = 20  # mosquitto's max_inflight_messages
 _QUEUED = 1000  # mosquitto's max_queued_messages
@@ -21,9 +130,8 @@ _QUEUED = 1000  # mosquitto's max_queued_messages
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A message of an operator: when it was published, whether it is retained, and when it left the broker's queue."""
+    """A message of an operator, whether it is retained, and when it left the broker's queue."""
 
-    sent_at: float
     payload: bytes
     retained: bool
     topic: str
@@ -35,7 +143,7 @@ class Received:
     """What a client published."""
 
     at: float
-    message: mqtt.Publish
+    message: Publish
 
 
 class Line(Protocol):
@@ -54,11 +162,11 @@ class VirtualBroker:
         self.running = True
         self.frozen = False
         self.received: list[Received] = []
-        self.retained: dict[str, mqtt.Publish] = {}
+        self.retained: dict[str, Publish] = {}
         self.violations: list[str] = []
         self.refused: set[str] = set()  # topics that no client may subscribe to
         self._sessions: list[Session] = []
-        self._backlog: deque[tuple[mqtt.Publish, Command]] = deque()
+        self._backlog: deque[tuple[Publish, Command]] = deque()
 
     def kill(self) -> None:
         """Kill the broker: every connection is reset, and all state is lost."""
@@ -95,16 +203,16 @@ class VirtualBroker:
 
     def publish(self, topic: str, payload: bytes, *, qos: int = 0, retain: bool = False) -> None:
         """Publish as the operator."""
-        self.route(mqtt.Publish(topic, payload, qos, retain))
+        self.route(Publish(topic, payload, qos, retain))
 
-    def route(self, message: mqtt.Publish) -> None:
-        command = Command(self.now(), message.payload, retained=False, topic=message.topic)
+    def route(self, message: Publish) -> None:
+        command = Command(message.payload, retained=False, topic=message.topic)
         if self.frozen:
             self._backlog.append((message, command))
         elif self.running:
             self._route(message, command)
 
-    def _route(self, message: mqtt.Publish, command: Command) -> None:
+    def _route(self, message: Publish, command: Command) -> None:
         if message.retain and message.payload:
             self.retained[message.topic] = message
         elif message.retain:
@@ -141,14 +249,14 @@ class Session:
         self.line, self.client_id = line, ""
         self._broker = broker
         self._buffer = bytearray()
-        self._will: mqtt.Publish | None = None
+        self._will: Publish | None = None
         self._wanted: dict[str, int] = {}
         self._patterns: list[str] = []  # those with wildcards
         self._limit_s = 10.0  # for the CONNECT; then the keepalive
         self._received_at = broker.now()
         self._number = 0
         self._in_flight: set[int] = set()
-        self._queue: deque[tuple[mqtt.Publish, Command]] = deque()
+        self._queue: deque[tuple[Publish, Command]] = deque()
 
     @property
     def queued(self) -> int:
@@ -159,9 +267,9 @@ class Session:
         self._buffer += data
         self._received_at = self._broker.now()
         try:
-            while not self._broker.frozen and (found := mqtt.split(self._buffer)):
+            while not self._broker.frozen and (found := split(self._buffer)):
                 self._handle(*found)
-        except (mqtt.MqttError, struct.error, UnicodeDecodeError, IndexError) as error:
+        except (MqttError, struct.error, UnicodeDecodeError, IndexError) as error:
             self._broker.violations.append(f"{type(error).__name__}: {error}")
             self.close()
 
@@ -179,7 +287,7 @@ class Session:
             will, self._will = self._will, None
             self._publish(will)
 
-    def offer(self, message: mqtt.Publish, command: Command) -> None:
+    def offer(self, message: Publish, command: Command) -> None:
         granted = self._granted(message.topic)
         if granted is None:
             return
@@ -196,42 +304,42 @@ class Session:
             return exact
         return max((self._wanted[one] for one in self._patterns if matches(one, topic)), default=None)
 
-    def _deliver(self, message: mqtt.Publish, command: Command) -> None:
+    def _deliver(self, message: Publish, command: Command) -> None:
         if message.qos:
             self._number = self._number % 65535 + 1
             self._in_flight.add(self._number)
             message = replace(message, packet_id=self._number)
-        self.line.send(mqtt.publish(message), replace(command, left_at=self._broker.now()))
+        self.line.send(published(message), replace(command, left_at=self._broker.now()))
 
     def _handle(self, kind: int, flags: int, body: bytes) -> None:
-        if (kind == mqtt.CONNECT) == bool(self.client_id):
-            raise mqtt.MqttError(f"a packet of type {kind} {'after' if self.client_id else 'before'} CONNECT")
-        if kind == mqtt.CONNECT:
-            self._connect(mqtt.read_connect(body))
-        elif kind == mqtt.PUBLISH:
-            self._published(mqtt.read_publish(flags, body))
-        elif kind == mqtt.SUBSCRIBE:
-            self._subscribe(*mqtt.read_subscribe(body))
-        elif kind == mqtt.PINGREQ:
-            self.line.send(mqtt.packet(mqtt.PINGRESP))
-        elif kind == mqtt.PUBACK:
+        if (kind == CONNECT) == bool(self.client_id):
+            raise MqttError(f"a packet of type {kind} {'after' if self.client_id else 'before'} CONNECT")
+        if kind == CONNECT:
+            self._connect(read_connect(body))
+        elif kind == PUBLISH:
+            self._published(read_publish(flags, body))
+        elif kind == SUBSCRIBE:
+            self._subscribe(*read_subscribe(body))
+        elif kind == PINGREQ:
+            self.line.send(packet(PINGRESP))
+        elif kind == PUBACK:
             self._acknowledged(*struct.unpack("!H", body))
         else:
             self._will = None
             self.close()
 
-    def _connect(self, connect: mqtt.Connect) -> None:
+    def _connect(self, connect: Connect) -> None:
         self.client_id, self._will = connect.client_id, connect.will
         self._limit_s = 1.5 * connect.keepalive_s or float("inf")
         self._broker.taken_over(by=self)
-        self.line.send(mqtt.packet(mqtt.CONNACK, bytes(2)))
+        self.line.send(packet(CONNACK, bytes(2)))
 
-    def _published(self, message: mqtt.Publish) -> None:
+    def _published(self, message: Publish) -> None:
         self._publish(message)
         if message.qos:
-            self.line.send(mqtt.packet(mqtt.PUBACK, struct.pack("!H", message.packet_id)))
+            self.line.send(packet(PUBACK, struct.pack("!H", message.packet_id)))
 
-    def _publish(self, message: mqtt.Publish) -> None:
+    def _publish(self, message: Publish) -> None:
         self._broker.received.append(Received(self._broker.now(), message))
         self._broker.route(message)
 
@@ -240,15 +348,15 @@ class Session:
         self._patterns += [topic for topic, _ in wanted if "+" in topic and topic not in refused]
         codes = bytes(0x80 if topic in refused else min(qos, 1) for topic, qos in wanted)
         self._wanted.update((topic, qos) for topic, qos in wanted if topic not in refused)
-        self.line.send(mqtt.packet(mqtt.SUBACK, struct.pack("!H", number) + codes))
+        self.line.send(packet(SUBACK, struct.pack("!H", number) + codes))
         for topic, qos in wanted:
             for retained in [one for one in self._broker.retained.values() if matches(topic, one.topic)]:
                 copy = replace(retained, qos=min(qos, retained.qos), retain=True)
-                self._deliver(copy, Command(self._broker.now(), retained.payload, retained=True, topic=retained.topic))
+                self._deliver(copy, Command(retained.payload, retained=True, topic=retained.topic))
 
     def _acknowledged(self, number: int) -> None:
         if number not in self._in_flight:
-            raise mqtt.MqttError(f"a PUBACK for {number}, which was not sent")
+            raise MqttError(f"a PUBACK for {number}, which was not sent")
         self._in_flight.discard(number)
         while self._queue and len(self._in_flight) < _IN_FLIGHT:
             self._deliver(*self._queue.popleft())
