@@ -40,7 +40,7 @@ def without_name(topic: str) -> Named | None:
 
 
 def stop_topic(topic: str) -> str | None:
-    """Return a topic of stops without its accounts, valid or not; None for another topic, or if it has no account."""
+    """Return a stop's topic without its accounts, valid or not; None if it has none, or is no topic of a stop."""
     match = _STOP.fullmatch(topic)
     return None if match is None else match[1] + match[2]
 

@@ -255,7 +255,7 @@ class MqttBridge(ForwardingService):
         """Open the forwarder's gate if the two sides cannot be one broker; otherwise begin a round of probing."""
         if not self._same_broker.possible:
             if self._same_broker.announces:
-                self._same_broker.send()  # before anything is forwarded: the mirror may have to shut
+                self._same_broker.send()  # a mirror of this very broker then shuts before anything is forwarded
             self._open()
         if self.forwarder.gate is Gate.OPEN or not self._same_broker.both_connected:
             return

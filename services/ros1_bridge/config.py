@@ -261,7 +261,7 @@ RULES: tuple[Rule, ...] = ((Root, _check),)
 
 
 def programs(config: Config) -> list[Program]:
-    """Return the process. Without driving it has another name, so that the robot has no motor owner."""
+    """Return the bridge's program, or none. One that only reads has another name, which is no motor owner's."""
     section = config.section(Ros1)
     if not section.enabled:
         return []

@@ -62,7 +62,7 @@ class Clips:
         """
         path = self._path(name)
         clip = self._clip(path, name)
-        if clip is None and path is not None and not name.isascii():
+        if clip is None and path is not None and path.suffix.lower() in self._endings and not name.isascii():
             clip = self._clip(self._path(meant(self._paths(), str(path))), name)
         return clip
 
@@ -87,7 +87,7 @@ class Clips:
         return Clip(inside if is_text(inside) else name, path)  # ``name`` is then that of a link to this file
 
     def _paths(self) -> Iterator[str]:
-        """Return the paths of all clips, as the folder has them."""
+        """Yield the paths of the clips among the first _MOST files, as the folder has them."""
         return filter(self._is_clip, islice(self._files(self._folder.resolve()), _MOST))
 
     def _files(self, root: Path) -> Iterator[str]:

@@ -75,7 +75,7 @@ class MemoryHub:
                     client.receive(_Delivery(live, publisher))
 
     def now(self) -> float | None:
-        """Return the time at which messages are delivered; None in a simulated time."""
+        """Return the time of a delivery, since boot; None in subclasses for tests that simulate time."""
         return clock.since_boot()
 
     def _wake_all(self) -> None:

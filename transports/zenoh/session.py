@@ -146,7 +146,7 @@ def _check_endpoint(name: str, endpoint: str, tls: TlsSettings | None) -> None:
 
 
 def _tls(tls: TlsSettings | None) -> dict[str, Any]:
-    """Return Zenoh's TLS settings: one certificate for listening and connecting. With a CA, both ends need one."""
+    """Return Zenoh's TLS settings: one certificate for both directions. With a CA, the other end needs one, too."""
     if tls is None:
         return {}
     link: dict[str, Any] = {"verify_name_on_connect": not tls.insecure}

@@ -93,7 +93,7 @@ class Audit(Observer):
         self._writer.add({"t": round(time.time(), 3), "what": what, "who": who, **more}, most=most)
 
     def passed(self, channel: Channel, by: str | None, payload: bytes) -> None:
-        """Add a row for a message that passed, without its parameters and keys; for a group, of each member."""
+        """Add a row for a message that passed, without parameters and keys; for a whole group, of each member."""
         if channel is GROUP:
             from pebble.contract import groups  # few robots get one
 
@@ -146,7 +146,7 @@ class Audit(Observer):
             key, now = (who, row["on"]), self._clock()
             last_at = self._lights.pop(key, -math.inf)
             if len(self._lights) >= _STOPS:
-                self._lights.clear()
+                self._lights.pop(next(iter(self._lights)))  # the one that rests longest
             self._lights[key] = now
             return now - last_at < WINDOW_S
         stop = row.get("stop", "")

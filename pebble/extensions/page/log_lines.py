@@ -66,7 +66,7 @@ class LogLines:
 
 
 class LogReader:
-    """A page's position in the lines of the component that it watches. It gets a part after each answer to a ping."""
+    """A page's place in the lines of the component that it watches. Each time it answers a ping, it gets more lines."""
 
     def __init__(self) -> None:
         self._on = False  # the page wants lines

@@ -1,4 +1,4 @@
-"""One media program as a process of its own, a device in this process, and an operator at a broker.
+"""A media program as a process of its own, a device in this process, and an operator at a broker.
 
 And for av_daemon: a writer that only remembers, and configs of one device.
 """

@@ -1,4 +1,4 @@
-"""What ``pebble check`` prints and refuses, and what is in ``pebble doctor --report``: no password and no key."""
+"""Output and refusals of ``pebble check``; the report of ``pebble doctor``, which holds no password and no key."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the doctor finds of a machine: its devices, recorder, unit, slot, disk, battery, and the page's certificate."""
+"""The doctor's findings of a machine: its devices, recorder, unit, slot, disk, battery, and the page's certificate."""
 
 from __future__ import annotations
 

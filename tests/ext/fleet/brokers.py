@@ -35,7 +35,7 @@ class Place(NamedTuple):
 
 
 class BrokerClient:
-    """One connection, open from its construction until its ``with`` block ends; without ``username`` anonymous."""
+    """A connection, open from its construction until its ``with`` block ends; without ``username`` anonymous."""
 
     def __init__(
         self,

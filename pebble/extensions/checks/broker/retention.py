@@ -101,4 +101,5 @@ def restarted(trial: BrokerTrial) -> CheckResult:
         late.subscribe("state", qos=trial.qos)
         if trial.wait(lambda: late.received, trial.answer_s / 3):  # noqa: B023
             return ok("it is there again" + (", some seconds later" if attempt else ""))
+    trial.late = False  # else this was tried again, and a person asked for a second restart
     return warn("it is gone", _PERSISTENT)

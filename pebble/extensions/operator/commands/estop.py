@@ -331,7 +331,7 @@ def _reset(target: Target) -> int:
         # for ``view.pace``; the times of arrival do not matter
         receiving.subscribe(LINK.topic(robot.base), lambda message: view.receive(LINK, message, 0.0, 0.0), direct=True)
         wait_for(lambda: robot.has_capabilities, _ANSWER_S)
-        receiving.ask(robot.missing)  # the capabilities may have come after the subscription
+        receiving.ask(robot.missing)  # stop states: the capabilities that list the owners may just have come
         wait_for(lambda: not robot.missing, _ANSWER_S)
         if not robot.states:
             raise PebbleError(f"{name} publishes no emergency stop: {_absent(robot)}")

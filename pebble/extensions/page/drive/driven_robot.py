@@ -242,7 +242,7 @@ class DrivenRobot:
         commands: list[Command] = []
         for tab, wish in list(self._wishes.items()):
             commands += self._follow_wish(tab, wish, now)
-        if self.client is None and self.keeps_control:  # from now on: control that this server has given is void
+        if self.client is None and self.keeps_control:  # the robot itself does now: what this server gave is void
             commands += self._on(Event.LOST, now)
         self._changed.add(self.ref)
         return commands

@@ -83,7 +83,10 @@ def start(
     if not file or file.startswith("-"):
         raise PebbleError(f'which script? see "pebble script list {robot}"')
     with _scripts(robot, target) as (transport, scripts, _):
-        file = meant(scripts.files or (), file)
+        try:
+            file = meant(scripts.files or (), file)
+        except PebbleError as error:
+            raise PebbleError(f"{shown(file)}: {error}") from None
         before, answers_before, began = scripts.status, scripts.answers, time.monotonic()
         _require_sent(transport, scripts.start(transport, file, context.args))
 

@@ -1,4 +1,4 @@
-"""What setup makes works: its broker lets in whom it should; backups become robots again, or are refused."""
+"""Robots that setup made: their broker lets in whom it should; backups become robots again, or are refused."""
 
 from __future__ import annotations
 

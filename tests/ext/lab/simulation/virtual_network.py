@@ -89,7 +89,7 @@ class Wire:
         return data
 
     def put(self, data: bytes) -> int:
-        """What fits into the board's send buffer."""
+        """Store what fits into the board's send buffer; return how many bytes that were."""
         room = WINDOW - sum(len(piece) for _, piece in self._up)
         data = data[: max(0, room)]
         if data:

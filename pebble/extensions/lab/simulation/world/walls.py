@@ -26,7 +26,7 @@ class Floor:
         self._poses = {name: start_pose(world, name) for name in world.robots}
 
     def mover(self, name: str) -> Mover:
-        """Return the floor as one robot's ground."""
+        """Return the view of the floor by which this robot moves."""
         return Mover(self, name)
 
     def move(self, name: str, start: Pose, end: Pose) -> Pose:
@@ -72,7 +72,7 @@ class Floor:
 
 
 class Mover:
-    """The floor as the ground of one robot."""
+    """A view of the floor for one robot: it moves that robot, up to walls and other robots."""
 
     def __init__(self, floor: Floor, name: str) -> None:
         self._floor, self._name = floor, name
