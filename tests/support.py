@@ -86,11 +86,11 @@ def until(condition: Callable[[], object], timeout: float = WAIT_S, *, step: flo
 
 
 @contextmanager
-def quickly() -> Iterator[None]:
-    """Check that the block waits for nothing that holds others up."""
+def quickly(seconds: float = SOON_S) -> Iterator[None]:
+    """Check that the block takes less than ``seconds``: it waits for nothing that holds others up."""
     began = time.monotonic()
     yield
-    assert time.monotonic() - began < SOON_S
+    assert time.monotonic() - began < seconds
 
 
 def errors(caplog: pytest.LogCaptureFixture) -> list[str]:

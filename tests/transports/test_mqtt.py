@@ -273,7 +273,7 @@ def test_close_does_not_wait_for_a_silent_broker(clients: Clients, proxy: TcpPro
     client.open(0.1)
     threads = {thread for thread in set(threading.enumerate()) - others if thread.name.startswith("pebble-mqtt")}
     assert threads
-    with quickly():
+    with quickly(2.5):
         client.close()
     assert until(lambda: not threads & set(threading.enumerate()))
 

@@ -72,7 +72,7 @@ def test_close_does_not_wait_for_a_resolver(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(socket, "getaddrinfo", hang)
     transport = create("mqtt", "tool", MqttSettings(host=NAME)).open(0.0)
     assert asked.wait(WAIT_S)
-    with quickly():
+    with quickly(2.5):
         transport.close()
     go_on.set()
 

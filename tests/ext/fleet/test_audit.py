@@ -38,7 +38,7 @@ def test_writing_never_blocks_and_what_was_locked_out_is_written(tmp_path: Path)
     log = Audit(tmp_path / "people.sqlite")
     blocker = sqlite3.connect(tmp_path / "people.sqlite", isolation_level=None)
     blocker.execute("BEGIN IMMEDIATE")
-    with quickly():
+    with quickly(2.5):
         for number in range(DIFFERENT + 3):
             log.write("flood", ref=f"{number}")
     blocker.execute("ROLLBACK")

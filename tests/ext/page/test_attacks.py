@@ -124,7 +124,7 @@ def test_a_session_that_is_revoked_while_driving_ends(hall: Hall, broker: Broker
                 page.drive(base, int(now_ms()), z=0.5)
             return page.closed
 
-        assert until(ends, step=0.05)
+        assert until(ends, 4.0, step=0.05)
         assert page.bye["why"]
         assert until(lambda: robot.drives()[-1]["z"] == 0), "the wheels stop"
         if how != "role":
