@@ -230,7 +230,7 @@ class MqttBridge(ForwardingService):
             self._check_brokers()
             return
         self._same_broker.send()  # the new connection may lead to another broker
-        if side is Side.REMOTE and epoch == self.epoch:
+        if side is Side.REMOTE and epoch == self.epoch:  # else it was lost: the next connection does it
             self.subscribe_remote()
 
     def subscribe_remote(self) -> None:

@@ -120,12 +120,12 @@ class Session:
         self.mcu_ms: int | None = None  # what its clock showed when it sent something of its own accord
         self._base = base
         self._splitter = LineSplitter(FRAME_LIMIT, END)
-        self._too_long = 0
+        self._too_long = 0  # frames, as reported last
         self._by_id: dict[int, Interface] = {}
         self.known: OrderedDict[Hello, Manifest] = OrderedDict()
         self._commands: OrderedDict[int, _Command] = OrderedDict()  # without an answer yet; the first is due first
         self._slots: dict[str, int] = {}  # by interface, or "group": the newest command's slot, below WAITING
-        self._sequence = 0
+        self._sequence = 0  # the number of our newest frame
         self._ask_at: float | None = None  # when to ask for the manifest; None: it is known, or there is no line
         self._received_at = self._pinged_at = self._asked_at = float("-inf")
 
