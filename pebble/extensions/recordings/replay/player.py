@@ -77,7 +77,7 @@ class BusOutput:
         if not self._publish(outgoing.message):
             return False
         self.sent += 1
-        if outgoing.moves is not None:
+        if outgoing.moves is not None:  # it is a drive command
             self._moved.pop(outgoing.message.topic, None)
             if outgoing.moves:
                 self._moved[outgoing.message.topic] = None
@@ -150,7 +150,7 @@ class Player:
         self._pace = Pace(now, speed=speed)
         self._now, self._wait = now, wait
         self._since_ns, self._loop, self._stays, self._longest_gap_ns = since_ns, loop, stays, longest_gap_ns
-        self._begins_ns = 0  # time of the first message
+        self._begins_ns = 0  # time of the first message; 0: there is none, or the player stays at the end
         self._waited = 0.0  # when ``wait`` returned last
 
     @property
