@@ -50,7 +50,7 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
         self._chain: list[bytes] = []
         self._chain_bytes = 0
         self.key: KeyFrame | None = None  # the newest one
-        self._seq = 0
+        self._seq = 0  # the number of the newest frame, of either stream
 
     # -- pages
 
