@@ -136,7 +136,7 @@ class Steps:
 
     def _check_board(self) -> list[Step]:
         """Return the steps that stop the board's program, and ask its MicroPython what it is."""
-        pulse = self._board.chip is not None
+        pulse = self._board.chip is not None  # the boards for esptool can be reset by the line's RTS
         how = "reset the board by RTS, then Ctrl-C" if pulse else "Ctrl-C; if the board ignores it, press reset"
 
         def interrupt() -> None:

@@ -185,6 +185,7 @@ class Job:
             "accounts, rules and certificate of the robot's own broker",
             lambda: folder.is_dir() and own_broker.knows(folder, wanted, passwords()),
             make_or_change,
+            # `change` makes a running broker read its files at once; after `make` it has to be restarted.
             (ROBOT_SERVICE,) if folder.is_dir() else (BROKER_SERVICE, ROBOT_SERVICE),
         )
         yield self._file(
