@@ -249,6 +249,7 @@ class Trial:
         gc.freeze()
         for file, text in self.texts.items():
             possible = script_mutants(file, text) if file.endswith(".js") else mutants(file, text)
+            # A draw: by a hash of the name in each mutant's record, which the seed changes.
             drawn = sorted(possible, key=lambda mutant: crc32(mutant[0]["name"].encode(), self.options.seed))
             report(file, len(drawn), [self.attempt(*mutant) for mutant in drawn[: self.options.n or None]])
         return True

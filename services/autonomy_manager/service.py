@@ -64,7 +64,8 @@ class AutonomyManager(Service):
         self.on_stop(processes.close)
         self._runner = Runner(self, spawn or processes, self._section.stop_timeout_seconds)
         self._offer = Offer(self.config, self.post, self._publish_files, scripts)
-        self._overridden_until = self._refused_until = float("-inf")
+        self._overridden_until = float("-inf")  # until then a person drives, not the script that runs
+        self._refused_until = float("-inf")  # until then the arbiter refuses scripts, so none is started
         self._status: AutonomyStatus | None = None
         self._connected_before = False
         self._waiting: Callable[[], None] | None = None  # a start, until its script is listed
