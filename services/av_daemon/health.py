@@ -60,7 +60,7 @@ class Health:
     def frame(self, info: FrameInfo, now: float, *, skipped: int = 0, content: int | str | None = None) -> None:
         """Note a frame. ``content`` differs between frames with different bytes; None: it was not computed."""
         self._dropped += skipped
-        if content is not None or self._info is None:  # without content its size is only what was asked for
+        if content is not None or self._info is None:  # without content ``info`` has only the size that was asked for
             self._info = info
         if content is not None:
             self._check.take(content, now)

@@ -48,7 +48,7 @@ class ZenohTransport(Transport):
         self._elsewhere = bool(settings.client and settings.connect)  # its hub and siblings are on other machines
         self._connecting = threading.RLock()  # held while subscribing, and while a connection is made
         self._subscribers: dict[Subscription, zenoh.Subscriber[None]] = {}
-        self._publishers = Publishers(lambda topic: self.policy.is_invented(topic))
+        self._publishers = Publishers(lambda topic: self.policy.is_invented(topic))  # set later, see TopicPolicy
         self._hub = HubConnection(client_id, will, self._own, self.count_received, settings.account)
         self._reset()
 
@@ -321,7 +321,7 @@ class ZenohTransport(Transport):
             self.count_received()
             read_at = clock.since_boot()
             stamp = wire.read_live(sample.attachment)
-            # A sender of the same boot shares the clock, so that also the time in the socket counts.
+            # A sender of the same boot shares the clock: time in the socket counts, too. A short time needs no look.
             since = stamp.sent_ns / 1e9 if stamp.boot == wire.BOOT else None
             if (since is None or read_at - since > late_s) and self._is_late(sample, stamp, read_at):
                 return
