@@ -94,6 +94,7 @@ class Health:
         return {} if info is None or asked is None else dict(self._problems(info, asked))
 
     def _problems(self, info: FrameInfo, asked: Asked) -> Iterator[tuple[str, str]]:
+        """Yield each problem of the frames: its kind, and its words."""
         check, sound, wrong_hz = self._check, info.rate > 0, self._check.wrong_hz
         if check.repeats:
             what = "gives the same sound" if sound else "shows the same picture"
