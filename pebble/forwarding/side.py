@@ -62,11 +62,11 @@ class SideState:
             self.subscribing()  # the transport does so at the next connection
             self.restarted = True
             self._lost_at = self._clock()
-            # A broker that ended may restore a save. Noted now: its retained messages may come before CONNECTED does.
-            # Of the side that wins it is noted at CONNECTED, and only if the transport has found older values there.
+            # A broker that ended may restore a save. Noted now, as its old messages may come before CONNECTED; for the
+            # side that wins only at CONNECTED, and only if the transport has found older values at its broker.
             self._went_back = not self._wins and self.transport.was_ended
         elif self._wins:
-            self._went_back = self._was_brief and self.transport.went_back  # else an operator may have set them
+            self._went_back = self._was_brief and self.transport.went_back  # brief: see RESTORED_S
 
     @property
     def has_gone_back(self) -> bool:

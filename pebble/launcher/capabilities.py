@@ -77,7 +77,7 @@ def _motor(
     """Return the offers of the motor MCU's serial line: drive, stop, lights and telemetry, with their topics in use."""
     lines, owned = config.motor_lines(), bool(config.motor_owners)
     present = bool(lines)
-    name = next(iter(lines), "")  # the first of several lines; "": the section, as the only line or for want of one
+    name = next(iter(lines), "")  # the first of several lines; "": the section is the only line, or there is none
     line = lines.get(name, config.services.serial_mcu_bridge)
     if name:
         addresses = Addresses(view_of(config, name))

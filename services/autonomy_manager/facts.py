@@ -47,6 +47,7 @@ def facts(config: Config) -> Facts:
 
 
 def _fitness(config: Config, script: Script) -> str:
+    """Return what a script runs with and what that lacks, or why it does not run, in words."""
     if script.broken:
         return f"does not run: {script.broken}"
     if script.ours:  # it uses pebble.script

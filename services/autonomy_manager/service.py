@@ -98,13 +98,13 @@ class AutonomyManager(Service):
         word = (command.action or "").strip().lower()
         is_known = word in (*_START, *STOP_WORDS)
         begin = word in _START if is_known else command.enabled
-        self._waiting = None
+        self._waiting = None  # a newer command takes the place of a start that waits
         if begin is None:
             self.log_limited.warning("command", "ignored a command that neither starts nor stops a script")
         elif begin:
             by = command.by if isinstance(command.by, str) else None
             start = partial(self._start_script, (command.file or "").strip(), command.config or {}, by)
-            start(self.clock() + _LISTED_S)
+            start(self.clock() + _LISTED_S)  # until then it may wait for the list of scripts
         else:
             self._runner.stop()
 
@@ -232,7 +232,7 @@ class AutonomyManager(Service):
             self._local.release()
             raise
         self._signs, self._unsigned_moves = plan.main.script.ours, False
-        for number in self._owners.steps_to(run):  # else an owner may take this run for an older one
+        for number in self._owners.steps_to(run):  # zeros on the way, or an owner may take this run for an older one
             self.halt(number)
         return run, self._owners.baseline()
 

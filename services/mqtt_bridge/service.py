@@ -79,7 +79,7 @@ class MqttBridge(ForwardingService):
         deciding_owner = min(self.config.motor_owners, default="")  # of several, the first by name gives control
         self._control_topic = c.CONTROL_STATE.topic(self.config.base, owner=deciding_owner) if deciding_owner else ""
 
-        # Private topics, which never leave the robot: none without an extension. No group of commands may have one.
+        # Private topics never leave the robot: none without an extension. A group with a command on one is dropped.
         private = next((extension.private for extension in self.config.installed if extension.private), "")
         self._private = (part(private) if private else PrivateTopics)(self.config.base)
         self.forwarder.stays = self._private.stays

@@ -48,7 +48,7 @@ class ZenohTransport(Transport):
         self._elsewhere = bool(settings.client and settings.connect)  # its hub and siblings are on other machines
         self._connecting = threading.RLock()  # held while subscribing, and while a connection is made
         self._subscribers: dict[Subscription, zenoh.Subscriber[None]] = {}
-        self._publishers = Publishers(lambda topic: self.policy.is_invented(topic))
+        self._publishers = Publishers(lambda topic: self.policy.is_invented(topic))  # set later, see TopicPolicy
         self._hub = HubConnection(client_id, will, self._own, self.count_received, settings.account)
         self._reset()
 

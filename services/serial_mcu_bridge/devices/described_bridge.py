@@ -329,7 +329,7 @@ class DescribedBridge(SerialService):
             self.transport.subscribe(self.addresses[GROUP].topic, receive, qos=QoS.DELIVERED, direct=True)
 
     def _on_manifest(self, message: Message) -> None:
-        """Handle the manifest of any device, on the transport's thread."""
+        """Handle the manifest of any device, on the transport's thread. A wrong one is left out."""
         uid = MCU_DESCRIBE.names(message.topic).get("uid")
         if uid is None:  # the filter's + also matches an empty level
             self.counters.add("refused")

@@ -120,7 +120,7 @@ class Session:
         self.mcu_ms: int | None = None  # what its clock showed when it sent something of its own accord
         self._base = base
         self._splitter = LineSplitter(FRAME_LIMIT, END)
-        self._too_long = 0  # frames, as reported last
+        self._too_long = 0  # frames that were too long, as far as they were reported
         self._by_id: dict[int, Interface] = {}
         self.known: OrderedDict[Hello, Manifest] = OrderedDict()
         self._commands: OrderedDict[int, _Command] = OrderedDict()  # without an answer yet; the first is due first

@@ -93,6 +93,7 @@ def _layout(types: tuple[FieldType, ...]) -> struct.Struct:
 
 
 def _value(field: Field, raw: Any) -> Any:
+    """Return a field's value for JSON: the packed number, scaled, with no digits that it does not have."""
     if field.type is FieldType.BOOL:
         return raw
     if field.type is FieldType.F32:

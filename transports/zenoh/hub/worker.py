@@ -239,8 +239,8 @@ class HubWorker:
                     self._store.apply(record)
             except msgspec.DecodeError as error:
                 log.warning("journal %s has a record of another kind: %s", journal.path, error)
-        self._write_journal(journal)
-        self._await_wills()
+        self._write_journal(journal)  # without what was replaced, or is not admitted any more
+        self._await_wills()  # of clients that do not come back
 
     def _write_journal(self, journal: Journal) -> None:
         journal.rewrite((record.id, wire.encode(record)) for record in self._store.records())

@@ -71,9 +71,10 @@ def order(trial: BrokerTrial) -> CheckResult:
     trial.wait(lambda: all(b"%d" % newest in reader.payloads() for reader in readers))
     trial.wait_quiet(*readers)
     wrong = [reader for reader in readers if reader.payloads()[-1:] != [b"%d" % newest]]
-    # A last message with the retain flag was sent for the subscription, but later than newer live ones. Without the
-    # flag, the newest one is lost, or came before an older live one.
-    if any(not reader.received or not reader.received[-1].retain for reader in wrong):
+    # Of these, the newest message is lost, or came before an older live one. The other readers got a message with the
+    # retain flag last: it was sent for the subscription, but later than newer live ones.
+    live_last = [reader for reader in wrong if not reader.received or not reader.received[-1].retain]
+    if live_last:
         return failed("the last value that comes to a new subscription is not the newest", OTHER)
     if wrong:
         return warn("a retained value comes after a newer live one")

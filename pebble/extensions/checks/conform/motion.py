@@ -122,7 +122,7 @@ def at_the_wheel(robot: Observer, by: str = BY, answer_s: float = ANSWER_S) -> I
             robot.answers(lambda: driver.holds, answer_s)
         if driver.may_drive:
             driver.send()
-            robot.wait(lambda: moves_until(robot, time.monotonic()) != inf, ANSWER_S)  # until it is not seen to move
+            robot.wait(lambda: moves_until(robot, time.monotonic()) != inf, ANSWER_S)  # inf: it still moves
         yield driver
     finally:
         if driver.may_drive:
@@ -151,7 +151,7 @@ def rested(robot: Observer, began: float, last: float, limit_s: float, what: str
     until = moves_until(robot, began)
     if until is None:
         return _NOT_SHOWN
-    if until == 0.0:
+    if until == 0.0:  # no motion was seen
         return failed("its commands do not move it", "drive by incoming/drive-values, live ones")
     if until > last + limit_s + LATE_S / 2:  # ``until`` is when a report arrived, a little after the motion
         shown = "still moves" if until == inf else f"moved for {until - last:.2f} s"

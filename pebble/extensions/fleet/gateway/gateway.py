@@ -243,6 +243,7 @@ class Gateway:
         return self._first.setdefault(base, heartbeat) != heartbeat
 
     def _on_gateway(self, message: Message) -> None:
+        """Note a gateway's heartbeat, or its end, an empty message. A retained one shows no live gateway."""
         address = parse_topic(message.topic)
         if address is None:
             return

@@ -97,7 +97,7 @@ class Steps:
 
     def _micropython(self) -> list[Step]:
         image = self._options.micropython
-        assert image is not None  # noqa: S101 - asked by all()
+        assert image is not None  # noqa: S101 - `all` asks for these steps only with one
         check = Step(
             title=f"check: {image.name} is MicroPython for {self._board.title}",
             act=lambda: images.check_image(image, self._board),

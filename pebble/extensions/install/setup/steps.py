@@ -267,11 +267,11 @@ class Job:
         """
         unfinished = self.places.unfinished
         services = {service for step in steps for service in step.restarts}
-        if unfinished.exists():
+        if unfinished.exists():  # of a setup that failed before its restarts, or of a backup that was restored
             services |= {ROBOT_SERVICE, *([BROKER_SERVICE] if self.answers.broker == HERE else [])}
         try:
             for step in steps:
-                if not unfinished.exists():
+                if not unfinished.exists():  # written with the first step: without any, nothing is unfinished
                     self.system.write(unfinished, b"")
                 step.do()
             for service in (BROKER_SERVICE, ROBOT_SERVICE):

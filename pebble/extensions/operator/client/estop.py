@@ -182,7 +182,7 @@ class RobotStop:
             return []
         self._sent_at, self.next, self._names_due = now, now + REPEAT_S, False
         estop, messages = self.estop, []
-        if not estop.old:
+        if not estop.old:  # old: it is known to have no emergency stop
             messages.append(_message(ESTOP, ESTOP.topic(estop.base), self._order.payload))
         cannot_latch = estop.old or bool(estop.zeros)
         if cannot_latch and not self._script_ended:  # else the script would drive on between two zeros

@@ -277,7 +277,7 @@ def as_object(payload: bytes) -> bytes | None:
     """
     payload = codec.trim(payload)
     try:
-        payload.decode()
+        payload.decode()  # raises if it is not UTF-8
         value = msgspec.json.decode(payload)
     except (UnicodeDecodeError, msgspec.DecodeError, RecursionError):
         return None

@@ -124,7 +124,7 @@ class Writing:
         try:
             file.add(item, at_ns)
         except OSError as error:
-            self._fail(lane, error)  # it keeps this item, which is among those that the file has not written
+            self._fail(lane, error)  # this item is among the unwritten ones, which go into the next file
 
     def flush(self) -> None:
         """Write all added messages to the files."""

@@ -151,7 +151,7 @@ class Player:
         self._now, self._wait = now, wait
         self._since_ns, self._loop, self._stays, self._longest_gap_ns = since_ns, loop, stays, longest_gap_ns
         self._begins_ns = 0  # time of the first message; 0: there is none, or the player stays at the end
-        self._waited = 0.0  # when ``wait`` returned last
+        self._waited_at = 0.0  # when ``wait`` returned last
 
     @property
     def sent(self) -> int:
@@ -232,7 +232,7 @@ class Player:
     def _step(self) -> None:
         """Wait, send one message, or end: what is due now."""
         now, reading = self._now(), self._reading
-        if now - self._waited > _TICK_S:  # also if messages are due all the time, ``wait`` may pause or stop this
+        if now - self._waited_at > _TICK_S:  # also if messages are due all the time, ``wait`` may pause or stop this
             self._pass(0.0)
         elif reading.state:
             if self._send(reading.state[-1], self._pace.from_ns):  # the last one comes first
@@ -267,7 +267,7 @@ class Player:
 
     def _pass(self, seconds: float) -> None:
         self._wait(seconds)
-        self._waited = self._now()
+        self._waited_at = self._now()
 
     def _end(self) -> None:
         self._output.halt()

@@ -198,7 +198,7 @@ class Renderer:
 
     def _draw_floor(self, me: RobotPose, out: Image) -> None:
         sine, cosine, height = math.sin(me.heading), math.cos(me.heading), self._lens.height_m
-        to_camera = np.array(
+        to_camera = np.array(  # from (x, y, 1) on the floor to (right, down, ahead) of the camera
             [
                 [sine, -cosine, -sine * me.x + cosine * me.y],
                 [0.0, 0.0, height],
