@@ -8,8 +8,13 @@ _KEY = re.compile(_NAMES, re.IGNORECASE).search
 _NAME = rf"[\w-]{{0,40}}(?:{_NAMES}|pwd)[\w-]{{0,40}}"
 _PAIR = re.compile(rf"(\b(?:{_NAME}|[\w-]{{0,40}}\bsig(?:nature)?)=)[^&\s]+", re.IGNORECASE)  # of a query or an option
 _END = r"(?<!_file)(?<!_env)"  # of a name; what is in a file or a variable stays there
-#: A member of an object in JSON, and in JSON that is itself a text there.
-_MEMBER = re.compile(rf'("{_NAME}{_END}"\s*:\s*")(?:[^"\\]|\\.)+|(\\"{_NAME}{_END}\\"\s*:\s*\\")[^"\\]+', re.IGNORECASE)
+#: A member of an object in JSON, in JSON that is itself a text there, and in Python's writing.
+_MEMBER = re.compile(
+    rf'("{_NAME}{_END}"\s*:\s*")(?:[^"\\]|\\.)+'
+    rf'|(\\"{_NAME}{_END}\\"\s*:\s*\\")[^"\\]+'
+    rf"|('{_NAME}{_END}'\s*:\s*')(?:[^'\\]|\\.)+",
+    re.IGNORECASE,
+)
 is_secret_option = re.compile(rf"--?{_NAME}", re.IGNORECASE).fullmatch
 # URLs in a URL are percent-encoded: %3A is a colon, %2F a slash, %40 an @.
 _AT = re.compile("@|%40")
@@ -32,7 +37,7 @@ def without_secrets(text: str) -> str:
     if _AT.search(text):
         text = re.sub(r"\S+", _without_login, _LOGIN_WITH_BLANKS.sub(rf"\1{HIDDEN}@", text))
     text = _PAIR.sub(rf"\1{HIDDEN}", text) if "=" in text else text
-    return _MEMBER.sub(lambda match: f"{match[1] or match[2]}{HIDDEN}", text) if '":' in text else text
+    return _MEMBER.sub(lambda match: f"{match[match.lastindex or 0]}{HIDDEN}", text) if ":" in text else text
 
 
 def _without_login(match: re.Match[str]) -> str:
