@@ -123,7 +123,7 @@ class StopConnection:
         self._failing_since = float("-inf")  # when it was last subscribed to stops, or not needed
         self._off_until = float("-inf")  # when it is tried again
         self._connected_at = float("inf")
-        self._kicks = 0  # how often in a row the main connection was lost for it
+        self._kicks = 0  # how often in a row the main connection was lost because of this one
         transport.policy.is_stop = lambda _topic: True  # it is subscribed to nothing else
         self._reported: bool | None = None  # the log says that it is there, or that it is not
         transport.on_state(self._on_state)
@@ -158,7 +158,7 @@ class StopConnection:
     def main_lost(self, *, ended: bool) -> None:
         """Note that the main connection is lost; ``ended``: the broker has closed it."""
         self._copies.forget()
-        if self._clock() - self._connected_at >= _KICKED_S:  # this one is not why it was lost
+        if self._clock() - self._connected_at >= _KICKED_S:  # it was not lost because of this one
             self._kicks = 0
         elif ended and self.listens:
             self._kicks += 1
