@@ -37,10 +37,10 @@ class SideState:
         self.count_forwarded = counters.adder(f"{side.value}: forwarded")
         self.events = EventBuffer(transport, counters, clock=clock)
         self.window = RetainedWindow(transport, clock)
-        self.loopback = LoopbackFilter(clock)  # of a broker without bridge mode
-        self.returns = LoopbackFilter(clock, _RETURN_S)  # those on topics that circulate: each comes back once
+        self.loopback = LoopbackFilter(clock)  # what a broker without bridge mode sends back
+        self.returns = LoopbackFilter(clock, _RETURN_S)  # what we forward on topics that circulate: it comes back once
         self.seen: set[str] = set()  # two-way topics that have had a message since we subscribed
-        self.restarted = False  # its connection was lost, and the reconciliation is still to be told
+        self.restarted = False  # its connection was lost; the reconciliation does not know yet
         self._clock, self._wins = clock, wins
         self._lost_at = float("-inf")  # when its state was last another than connected; -inf: never
         # Its broker has restored older retained messages (if this side wins), or may have; False once all are here.

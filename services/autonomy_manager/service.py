@@ -178,15 +178,16 @@ class AutonomyManager(Service):
             return
         elif self._signs or drive.key:  # a person's: the script would sign it, or have no key
             self._person_moves = drive.moves
-            self.post(self._person_drives, newest_of="person")
+            self.post(self._on_person_drives, newest_of="person")
             if not drive.moves and drive.valid_ms == 0:  # a final zero: no script resumes after it
-                self.post(self._person_stops, newest_of="person stops")
+                self.post(self._on_person_stops, newest_of="person stops")
         else:  # an unsigned script's, or a person's
             self._unsigned_moves = drive.moves
 
-    def _person_drives(self) -> None:
+    def _on_person_drives(self) -> None:
         """Let scripts wait for a person who drives, or end them, as the config says."""
-        now, self._waiting = self.clock(), None
+        now = self.clock()
+        self._waiting = None  # a start that waits is given up
         if self._runner.active is not None and self._runner.drives and self._section.on_override == "stop":
             self._runner.stop(OVERRIDDEN)
         if now >= self._overridden_until:
@@ -194,7 +195,7 @@ class AutonomyManager(Service):
         self._overridden_until = now + _HOLD_S
         self.changed()
 
-    def _person_stops(self) -> None:
+    def _on_person_stops(self) -> None:
         """End a script that does not sign its commands; refuse starts while the arbiter still refuses scripts."""
         self._refused_until = self.clock() + _HOLD_S
         self._end_unsigned()

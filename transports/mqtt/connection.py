@@ -170,7 +170,7 @@ class Connection:
             if now >= self.pings.due_at:
                 self.pings.send(client)
             owes = client.owes
-            if not owes:
+            if not owes:  # otherwise MQTT's acknowledgements carry TCP's
                 self._quick_ack()
             messages, incoming.messages = incoming.messages, []
             answers = incoming.answers

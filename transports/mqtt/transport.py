@@ -157,7 +157,7 @@ class MqttTransport(Transport):
                 return  # the next connection subscribes to them
             # Retained messages come after the SUBACK, on a bad network long after it; a ping's answer follows them.
             acks.append(connection.ping())
-        if self._network is None or threading.current_thread() is not self._network.thread:  # which reads the answers
+        if self._network is None or threading.current_thread() is not self._network.thread:  # it reads the answers
             deadline = time.monotonic() + _ANSWER_S
             for ack in acks:
                 ack.wait(deadline - time.monotonic())

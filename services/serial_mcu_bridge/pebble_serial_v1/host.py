@@ -192,7 +192,7 @@ class Session:
             if len(self._commands) > _OPEN_COMMANDS:
                 self._commands.popitem(last=False)
         kind = str(wanted[0][0].id) if len(wanted) == 1 else "group"
-        # a newer line replaces one of the same kind: so commands take turns in kinds, and WAITING of them can wait
+        # A line replaces a waiting one of its kind. With WAITING kinds, used in turn, as many commands can wait.
         slot = self._slots[kind] = (self._slots.get(kind, 0) + 1) % WAITING
         return Send(f"command {kind}/{slot}", data)
 

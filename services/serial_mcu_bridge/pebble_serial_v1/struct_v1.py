@@ -106,6 +106,7 @@ def _value(field: Field, raw: Any) -> Any:
 
 
 def _raw(field: Field, values: Mapping[str, Any]) -> Any:
+    """Return the number to pack for a field. Raises PayloadError."""
     if field.name not in values:
         raise PayloadError(f"{field.name} is missing")
     value = values[field.name]

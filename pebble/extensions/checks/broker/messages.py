@@ -256,6 +256,7 @@ def _lacks_of_flags(trial: BrokerTrial, peer: Peer, *, modern: bool) -> str:
 
 
 def last_will(trial: BrokerTrial) -> CheckResult:
+    """Check that the will of a client whose connection is reset is published soon, and retained."""
     reader, retain = trial.peer(), trial.retains
     reader.subscribe("#", qos=trial.qos)
     try:
@@ -267,11 +268,11 @@ def last_will(trial: BrokerTrial) -> CheckResult:
     began = time.monotonic()
     robot.cut()
     if not trial.wait(lambda: b"gone" in reader.payloads(), 3 * trial.answer_s):
-        trial.late = True
+        trial.late = True  # so that `judge` tests a second time
         return warn("none is published when a connection is reset", "allow wills (an access list may forbid them)")
     seconds = time.monotonic() - began
     if seconds > _WILL_S + trial.round_trip_s:
-        trial.late = True
+        trial.late = True  # as above
         return warn(f"one is published {seconds:.1f} s after the connection is reset")
     late = trial.peer()
     late.subscribe("online", qos=trial.qos)

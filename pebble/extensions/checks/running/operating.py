@@ -166,8 +166,9 @@ def wheels(robot: RobotUnderTest) -> CheckResult:
 
 
 def _drive(robot: RobotUnderTest, driver: Driver, speed: float) -> CheckResult:
+    """Drive for a moment; judge by the robot's own reports whether it moved, and came to rest."""
     began, last = driver.drive(_DRIVES_S, z=speed)
-    robot.wait(lambda: False, robot.rests_s + LATE_S)
+    robot.wait(lambda: False, robot.rests_s + LATE_S)  # in any case: until it must rest
     if robot.view.latched:
         return failed("it was stopped meanwhile", "pebble estop status CONFIG")
     if not driver.may_drive:

@@ -195,7 +195,7 @@ class Gateway:
             for base in waiting[:TOGETHER]
         ]
         for transport in (hub, broker):
-            transport.policy.is_stop = is_stop  # instead of the newest forwarder's, which knows its own robot
+            transport.policy.is_stop = is_stop  # each Forwarder has set it for its own robot only
         self._has_begun = True
         self._carried |= {robot.base: robot for robot in robots}
         with self._beginning:  # measures how long this takes

@@ -141,7 +141,7 @@ class Player:
         """Prepare to play. ``wait`` waits up to so many seconds; ``now`` returns seconds and never goes back.
 
         ``stays``: pause at the end instead of returning, and accept any time as a position, also before the first
-        message. A pause of the recording is shortened to ``longest_gap_ns``.
+        message. A pause of the recording that is longer than ``longest_gap_ns`` is left out.
         """
         self.paused, self.ended = paused, False
         self.at_end = False  # it is paused there
@@ -249,11 +249,11 @@ class Player:
         """Send the next message if it is due, else wait for a moment."""
         due_s = self._pace.due_s(message.log_ns, now)
         if message.log_ns - self._pace.reached_ns > self._longest_gap_ns:
-            self._pace.go_on_from(message.log_ns)
+            self._pace.go_on_from(message.log_ns)  # leave out the rest of a long pause
         elif due_s > _NOW_S:
             self._pass(min(due_s, _TICK_S))
             return
-        if due_s < -_LATE_S:
+        if due_s < -_LATE_S:  # too late to catch up
             self._pace.go_on_from(message.log_ns)
         if self._send(message, message.log_ns):
             self._reading.advance()

@@ -236,6 +236,7 @@ def _is_of(channel: Channel, robot: str) -> bool:
 
 
 def _named(path: Path) -> _Named:
+    """Return the file with the facts that its name tells; a file with another name may hold anything."""
     match = NAME.fullmatch(path.name)
     if match is None:
         return _Named(path, "", 0)

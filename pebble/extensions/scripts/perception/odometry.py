@@ -213,8 +213,8 @@ class Odometry:
         part.turn_rad += turn if measured is None else measured
         self.pose = part.end(self._base)
         is_ready = self._left.hall.ready and self._right.hall.ready
-        if is_ready:  # the part will not be corrected any more
-            if self.moving(now) or not self._was_ready:  # a distance at rest is noise, unless a warm-up ends now
+        if is_ready:  # no warm-up of a sensor can correct the part any more
+            if self.moving(now) or not self._was_ready:  # at rest it is noise, unless a warm-up has just ended
                 self.distance_mm += abs(part.ahead_mm)
             self._base, self._part = self.pose, _Part()
         self._was_ready = is_ready
