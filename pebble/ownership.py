@@ -10,6 +10,7 @@ from typing import BinaryIO, NamedTuple
 
 from pebble.errors import PebbleError
 
+_ACCESS_LIST = "system.posix_acl_access"  # the attribute of a file that holds its list
 SUBUIDS = Path("/etc/subuid")  # whom users may be in containers of theirs: NAME:FIRST:COUNT
 
 
@@ -50,7 +51,7 @@ def owner_of(folder: Path, *, nameless: bool = True, there: bool = False) -> Own
             return owner_of(place.parent.joinpath(target, *names), nameless=nameless, there=there)
         if owner.uid not in (0, uid):
             raise PebbleError(f"{place} belongs to user {uid}, and lies in a folder of user {owner.uid}: move it")
-        if uid == 0 and _is_shared(status):
+        if uid == 0 and _is_shared(place, status):
             raise PebbleError(f"{place} belongs to root, and others may write there: chmod go-w it, or chown it")
         owner = Owner(uid, status.st_gid)
     return owner
@@ -77,11 +78,13 @@ def _has_name(uid: int) -> bool:
     return False
 
 
-def _is_shared(folder: os.stat_result) -> bool:
+def _is_shared(folder: Path, status: os.stat_result) -> bool:
     """True if users other than the owner can replace files in the folder. In a sticky folder they cannot."""
-    writers = stat.S_IWOTH | (stat.S_IWGRP if folder.st_gid else 0)
-    is_sticky = bool(folder.st_mode & stat.S_ISVTX)
-    return bool(folder.st_mode & writers) and stat.S_ISDIR(folder.st_mode) and not is_sticky
+    if not stat.S_ISDIR(status.st_mode) or status.st_mode & stat.S_ISVTX:
+        return False
+    # With an access control list the group's bits are the most that any user in the list may do.
+    of_others = bool(status.st_gid) or _ACCESS_LIST in (os.listxattr(folder) if hasattr(os, "listxattr") else ())
+    return bool(status.st_mode & (stat.S_IWOTH | (stat.S_IWGRP if of_others else 0)))
 
 
 def is_open(folder: Path) -> bool:

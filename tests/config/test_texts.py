@@ -138,6 +138,9 @@ def test_a_secret_on_a_command_line_is_not_printed_again(run: Run) -> None:
         (f'{{"password" : "{SECRET}"}}', '{"password" : "***"}'),
         (f"{{'mqtt_password': '{SECRET}', 'port': 1}}", "{'mqtt_password': '***', 'port': 1}"),
         (f'"{{\\"api_key\\": \\"{SECRET}\\"}}"', '"{\\"api_key\\": \\"***\\"}"'),
+        (f'curl -H "Authorization: Bearer {SECRET}" x', 'curl -H "Authorization: ***" x'),
+        (f'"{{\\"Cookie\\": \\"{SECRET}; b\\"}}"', '"{\\"Cookie\\": \\"***\\"}"'),
+        (f"{{'X-API-Key': '{SECRET}', 'cookie': ''}}", "{'X-API-Key': '***', 'cookie': ''}"),
         ('{"password_file": "x", "token": ""}', '{"password_file": "x", "token": ""}'),
     ],
 )

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shutil
+import struct
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -129,9 +130,22 @@ def shared(theirs: Path) -> Path:
     return theirs.parent / "roots" / "new"
 
 
+def listed(theirs: Path) -> Path:
+    """A folder of root's whose access control list lets nobody write: as setfacl -m u:nobody:rwx makes it."""
+    entries = ((1, 7, -1), (2, 7, NOBODY), (4, 5, -1), (16, 7, -1), (32, 5, -1))  # user, one user, group, most, others
+    packed = b"".join(struct.pack("<HHi", *entry) for entry in entries)
+    os.setxattr(theirs.parent / "roots", "system.posix_acl_access", struct.pack("<I", 2) + packed)
+    return theirs.parent / "roots" / "new"
+
+
 @pytest.mark.parametrize(
     ("path_of", "why"),
-    [(linked, "is a link of user 65534"), (of_root, "lies in a folder of user 65534"), (shared, "others may write")],
+    [
+        (linked, "is a link of user 65534"),
+        (of_root, "lies in a folder of user 65534"),
+        (shared, "others may write"),
+        (listed, "others may write"),
+    ],
 )
 def test_where_others_could_put_a_folder_it_does_nothing(
     path_of: Callable[[Path], Path], why: str, place: Path
