@@ -435,13 +435,10 @@ def _of_file(path: Path) -> Extension:
     """
     if not path.is_file():
         raise PebbleError(f"there is no file {path}")
-    if hasattr(os, "getuid") and os.getuid() == 0:
-        # Who may write in a folder may replace the file: in that of a link, and in that of the file behind it.
-        folders = (path.parent, path.resolve().parent)
-        uid = path.stat().st_uid or max(owner_of(folder, nameless=False).uid for folder in folders)
-        if uid:
-            why = "and root runs no code of other users: chown root it, in a folder of root's"
-            raise PebbleError(f"{path} belongs to user {uid}, {why}")
+    is_root = hasattr(os, "getuid") and os.getuid() == 0
+    if is_root and (uid := path.stat().st_uid or owner_of(path, nameless=False).uid):
+        why = "and root runs no code of other users: chown root it, in a folder of root's"
+        raise PebbleError(f"{path} belongs to user {uid}, {why}")
     name = path.stem
     if "." in name:
         raise PebbleError(f'a module has no "." in its name: rename the file {path.name}')

@@ -10,7 +10,6 @@ from typing import BinaryIO, NamedTuple
 
 from pebble.errors import PebbleError
 
-_ACCESS_LIST = "system.posix_acl_access"  # the attribute of a file that holds its list
 SUBUIDS = Path("/etc/subuid")  # whom users may be in containers of theirs: NAME:FIRST:COUNT
 
 
@@ -78,13 +77,20 @@ def _has_name(uid: int) -> bool:
     return False
 
 
-def _is_shared(folder: Path, status: os.stat_result) -> bool:
-    """True if users other than the owner can replace files in the folder. In a sticky folder they cannot."""
-    if not stat.S_ISDIR(status.st_mode) or status.st_mode & stat.S_ISVTX:
+def _is_shared(place: Path, status: os.stat_result) -> bool:
+    """True if users other than the owner can replace files in this folder, or change this file."""
+    mode = status.st_mode
+    is_sticky = stat.S_ISDIR(mode) and mode & stat.S_ISVTX  # there only owners remove files
+    if is_sticky or not (stat.S_ISDIR(mode) or stat.S_ISREG(mode)):
         return False
-    # With an access control list the group's bits are the most that any user in the list may do.
-    of_others = bool(status.st_gid) or _ACCESS_LIST in (os.listxattr(folder) if hasattr(os, "listxattr") else ())
-    return bool(status.st_mode & (stat.S_IWOTH | (stat.S_IWGRP if of_others else 0)))
+    return bool(mode & stat.S_IWOTH or (mode & stat.S_IWGRP and (status.st_gid or _has_access_list(place))))
+
+
+def _has_access_list(place: Path) -> bool:
+    """True if an access control list names users; the bits of the group are then the most that they may do."""
+    with suppress(AttributeError, OSError):  # a system or a file system that has no lists
+        return "system.posix_acl_access" in os.listxattr(place)
+    return False
 
 
 def is_open(folder: Path) -> bool:

@@ -130,6 +130,12 @@ def shared(theirs: Path) -> Path:
     return theirs.parent / "roots" / "new"
 
 
+def open_file(theirs: Path) -> Path:
+    (file := theirs.parent / "roots" / "robot.json").touch()
+    file.chmod(0o666)
+    return file
+
+
 def listed(theirs: Path) -> Path:
     """A folder of root's whose access control list lets nobody write: as setfacl -m u:nobody:rwx makes it."""
     entries = ((1, 7, -1), (2, 7, NOBODY), (4, 5, -1), (16, 7, -1), (32, 5, -1))  # user, one user, group, most, others
@@ -144,6 +150,7 @@ def listed(theirs: Path) -> Path:
         (linked, "is a link of user 65534"),
         (of_root, "lies in a folder of user 65534"),
         (shared, "others may write"),
+        (open_file, "others may write"),
         (listed, "others may write"),
     ],
 )
