@@ -21,18 +21,16 @@ WITHDRAWN_S = 60.0  # so long an owner may have no emergency stop before its pen
 NAMES = 1024  # of stops: a minute of 17 in a second
 
 
-def is_stop(payload: bytes) -> bool:
-    """True for every payload but two: an empty one, which removes a retained message, and a probe for cycles."""
-    return bool(payload) and not codec.is_blank(payload)
-
-
 def is_named(payload: bytes) -> bool:
-    return is_stop(payload) and codec.decode(ESTOP, payload).stop is not UNSET
+    return bool(payload) and codec.decode(ESTOP, payload).stop is not UNSET
 
 
 def named(payload: bytes) -> bytes:
-    """Return a stop from the remote side with a name, and without an owner, which only the bridge may add."""
-    if not is_stop(payload):
+    """Return a stop from the remote side with a name, and without an owner, which only the bridge may add.
+
+    Any payload is a stop but an empty one, which removes a retained message.
+    """
+    if not payload:
         return payload
     stop = codec.decode(ESTOP, payload)
     if stop.stop is not UNSET and stop.owner is UNSET:
@@ -100,7 +98,7 @@ class PassedStops:
 
         An owner that was reset after the stop was first forwarded gets a copy only if it has yet to confirm the stop.
         """
-        if not is_stop(payload):
+        if not payload:
             return [payload]
         stop = codec.decode(ESTOP, payload)
         now, name = self._clock(), str(stop.stop)
