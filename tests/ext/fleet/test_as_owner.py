@@ -31,6 +31,8 @@ from pebble.extensions.operator.places import Places
 from pebble.extensions.page.commands.people import opened
 from pebble.extensions.recordings.commands.files import mend
 from pebble.extensions.recordings.files.writer import RecordingWriter
+from pebble.extensions.recordings.recorder.folder import Folder
+from pebble.extensions.recordings.recorder.metrics import STATUS
 from pebble.launcher.launcher import Launcher
 from pebble.ownership import owner_of
 from pebble.runtime.as_owner import as_before, as_owner, require_own
@@ -220,6 +222,11 @@ def world(theirs: Path, _: Path) -> object:
     return program.run(program.ROOM)
 
 
+def recordings(theirs: Path, secret: Path) -> object:
+    (theirs / f".{STATUS}.part").symlink_to(secret)
+    return Folder(theirs).take()
+
+
 def holes(theirs: Path, _: Path) -> object:
     (theirs / "fleet.json").touch()
     os.truncate(theirs / "fleet.json", 1 << 40)
@@ -241,7 +248,7 @@ def copy(theirs: Path, _: Path) -> object:
 
 
 @pytest.mark.parametrize(
-    "act", [password, answers, robot, script, report, container, everybody, world, holes, lines, copy]
+    "act", [password, answers, robot, script, report, container, everybody, world, recordings, holes, lines, copy]
 )
 def test_what_a_user_names_root_neither_reads_nor_runs(
     act: Callable[[Path, Path], object], place: Path, monkeypatch: pytest.MonkeyPatch

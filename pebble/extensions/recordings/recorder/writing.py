@@ -9,7 +9,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from pebble.extensions.recordings.files.recorded import RecordingError
+from pebble.errors import PebbleError
 from pebble.extensions.recordings.recorder.background import Background
 from pebble.extensions.recordings.recorder.clock import Due, RecordingClock
 from pebble.extensions.recordings.recorder.disk_space import Disk, outdated, surplus
@@ -235,7 +235,7 @@ class Writing:
         try:
             self._follow_folder()
             disk = _disk(self._folder.root)
-        except RecordingError as error:
+        except PebbleError as error:
             self._stand_still(str(error))
             return
         except OSError as error:
@@ -256,7 +256,7 @@ class Writing:
             self.try_again()
 
     def _follow_folder(self) -> None:
-        """Use the folder that is now at the path. Raises RecordingError and OSError."""
+        """Use the folder that is now at the path. Raises PebbleError and OSError."""
         if self._folder.in_place:
             return
         self.flush()  # forgets the files that are not there any more
