@@ -128,8 +128,12 @@ def me(account: str | None = None) -> str:
 
 
 def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
-    """Send stops, and listen on a second connection, so that what arrives delays none of them."""
-    with interrupted_by_signals(), connected(target) as (transport, names):
+    """Send stops, and listen on a second connection, so that what arrives delays none of them.
+
+    A stop of one robot waits for a connection, as a broker may be restarting. Robots of a broker that is not there
+    cannot be found.
+    """
+    with interrupted_by_signals(), connected(target, needed=every) as (transport, names):
         robots = None if every else [names.base]
         sender = StopSender(new_name(), by=me(names.account), why=why, now=time.monotonic(), robots=robots, hold=hold)
         put_account_into_topics(
@@ -244,7 +248,7 @@ class _Report:
     def connection(self, problem: str) -> None:
         """Warn of an outage, once."""
         if problem and not self._problem:
-            _echo(f"pebble: warning: nothing is sent until there is a connection again: {problem}", err=True)
+            _echo(f"pebble: warning: nothing is sent until there is a connection: {problem}", err=True)
         self._problem = problem
 
     def update(self, now: float) -> None:
@@ -294,6 +298,8 @@ def _line(robot: RobotStop, *, is_early: bool, sent: bool) -> str:
             return "old firmware: NOT LATCHED, zeros are no longer sent"
         case Progress.SPARED:
             return "does not drive"
+        case Progress.NOT_CONFIRMED if not sent:
+            return "STOP NOT SENT: there was no connection"
         case Progress.NOT_CONFIRMED:
             return f"NOT CONFIRMED, no longer sent: {_why(robot)}"
     if is_early:

@@ -6,6 +6,7 @@ import itertools
 import os
 import pty
 import signal
+import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -174,6 +175,19 @@ def test_a_hold_stops_robots_that_come_online_later(robot_on: Make, url: str) ->
     assert f"{late.id}: was stopped, and reset since" in out
 
 
+def await_stop(process: subprocess.Popen[str], broker: Broker, robot: RecordingRobot) -> None:
+    """Start the broker once the command says that it waits, and await the confirmation."""
+    assert process.stderr is not None
+    assert process.stderr.readline().startswith("pebble: warning: nothing is sent until there is a connection: ")
+    robot.deaf = False
+    broker.start()
+    out, _ = process.communicate(timeout=50)
+    robot.close()
+    broker.stop()
+    assert process.returncode == 0, out
+    assert robot.latched
+
+
 def test_a_lost_broker_is_waited_for(tmp_path: Path) -> None:
     broker = Broker(tmp_path)
     robot = RecordingRobot(broker.port, "pebble/robots/lost", heartbeats=False)
@@ -182,17 +196,15 @@ def test_a_lost_broker_is_waited_for(tmp_path: Path) -> None:
     with running("estop", robot.id, f"--url=mqtt://127.0.0.1:{broker.port}") as process:
         assert until(lambda: robot.count("estop") >= 1)
         broker.kill()
-        assert process.stderr is not None
-        assert process.stderr.readline().startswith(
-            "pebble: warning: nothing is sent until there is a connection again"
-        )
-        robot.deaf = False
-        broker.start()
-        out, _ = process.communicate(timeout=50)
-    robot.close()
-    broker.stop()
-    assert process.returncode == 0, out
-    assert robot.latched
+        await_stop(process, broker, robot)
+
+
+def test_a_broker_that_restarts_is_waited_for(tmp_path: Path) -> None:
+    broker = Broker(tmp_path)
+    robot = RecordingRobot(broker.port, "pebble/robots/lost", heartbeats=False)
+    broker.kill()
+    with running("estop", robot.id, f"--url=mqtt://127.0.0.1:{broker.port}") as process:
+        await_stop(process, broker, robot)
 
 
 #: What a broker keeps, too long to arrive, of a stranger or of the robot itself, and who stops the robot all the same.
