@@ -348,6 +348,8 @@ class MqttBridge(ForwardingService):
             self._follow_owner(self._owners.topics[message.topic], message.payload)
         if message.topic == self._control_topic:
             self._follow_control(message.payload)
+        if message.topic == self._stop_topic and not message.retain:  # the owners have it unless one restarts now
+            self._passed_stops.accept(named(message.payload))
         self._leftovers.note_local(message)
         for admitted in self._private.admit(message):
             self._react(Side.LOCAL, admitted, self.forwarder.receive(Side.LOCAL, admitted))

@@ -186,6 +186,23 @@ def test_the_bridge_repeats_it_on_the_robots_side_only(monkeypatch: pytest.Monke
     assert not world.remote.on(STOP)
 
 
+@pytest.mark.parametrize("one", [True, False])
+def test_one_of_the_robots_own_side_is_repeated_too(one: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World("bridge", monkeypatch, one=one)
+    world.start(serial={"enabled": True, "serial": {"port": "/dev/serial"}})
+    world.run()
+    world.local.publish(STOP, b"{}")
+    world.run(1.9)
+    first, *repeated = [codec.decode(ESTOP, raw) for raw in world.local.payloads(STOP) if raw != b"{}"]
+    assert {(stop.stop, stop.owner) for stop in (first, *repeated)} == {(first.stop, "serial")}
+    state = replace_state(FREE, latched=True, count=1, recent=[first.stop])
+    world.local.publish(ESTOP_STATE.topic("", owner="serial")[1:], codec.encode(ESTOP_STATE, state), retain=True)
+    world.run(1)
+    before = len(world.local.on(STOP))
+    world.run(3)
+    assert len(world.local.on(STOP)) == before
+
+
 def test_what_a_withdrawn_owner_has_not_confirmed_is_told(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
