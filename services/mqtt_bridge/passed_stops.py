@@ -26,7 +26,7 @@ def is_named(payload: bytes) -> bool:
 
 
 def named(payload: bytes) -> bytes:
-    """Return a stop from the remote side with a name, and without an owner, which only the bridge may add.
+    """Return a stop with a name, and without an owner, which only the bridge may add.
 
     Any payload is a stop but an empty one, which removes a retained message.
     """
