@@ -4,11 +4,14 @@ import os
 from pathlib import Path
 
 from pebble.errors import PebbleError
-from pebble.runtime.whole_file import sync_folder
+from pebble.ownership import owner_of
+from pebble.runtime.whole_file import is_root, sync_folder
 
 
 def write_new(file: Path, content: bytes) -> None:
-    """Write a new file that only its owner can read. Raises PebbleError."""
+    """Write a new file that only its owner can read. Raises PebbleError, as root also as :func:`owner_of`."""
+    if is_root():
+        owner_of(file)
     try:
         descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o600)
     except OSError as error:

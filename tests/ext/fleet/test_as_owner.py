@@ -18,6 +18,7 @@ import pytest
 from pebble import ownership
 from pebble.config import load
 from pebble.errors import PebbleError
+from pebble.extensions.checks.new_file import write_new
 from pebble.extensions.checks.report.report import make
 from pebble.extensions.checks.report.secrets_here import secrets_of
 from pebble.extensions.fleet import applying
@@ -61,12 +62,16 @@ def page(folder: Path) -> None:
     People(folder / "file").close()
 
 
+def new(folder: Path) -> None:
+    write_new(folder / "file", b"written")
+
+
 def text(folder: Path) -> None:
     with as_owner(folder):
         (folder / "file").write_text("written")
 
 
-@pytest.mark.parametrize("write", [people, page, text])
+@pytest.mark.parametrize("write", [people, page, text, new])
 @pytest.mark.parametrize("there", [False, True])
 def test_a_link_leads_it_nowhere(write: Callable[[Path], None], there: bool, place: Path) -> None:
     roots, folder = place / "roots", place / "theirs"
@@ -163,8 +168,11 @@ def test_where_others_could_put_a_folder_it_does_nothing(
     roots.mkdir(0o755)
     folder.mkdir()
     os.chown(folder, NOBODY, NOBODY)
-    with pytest.raises(PebbleError, match=why), as_owner(path_of(folder)):
+    path = path_of(folder)
+    with pytest.raises(PebbleError, match=why), as_owner(path):
         pass
+    with pytest.raises(PebbleError, match=why):
+        write_new(path, b"")
 
 
 def config(theirs: Path, **services: object) -> Path:
