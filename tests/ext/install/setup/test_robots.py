@@ -344,6 +344,7 @@ FOREIGN: dict[str, tuple[bytes, str]] = {
     "a link": (tar_of(HEAD, ("etc/x", b""), kind=tarfile.SYMTYPE), "is not what a backup has"),
     "a hole": (tar_of(HEAD, ("etc/x", b""), kind=tarfile.GNUTYPE_SPARSE), "is not what a backup has"),
     "a device": (tar_of(HEAD, ("etc/x", b""), kind=tarfile.CHRTYPE), "is not what a backup has"),
+    "a long name": (tar_of(HEAD, (f"etc/{'x' * 256}", b"x")), "is not what a backup has"),
     "a broken name": (tar_of(HEAD, ("etc/./x", b"x")), "is not what a backup has"),
     "twice": (tar_of(HEAD, ("etc/x", b"1"), ("etc/x", b"2")), "is in it twice"),
 }
