@@ -40,11 +40,18 @@ def named(payload: bytes) -> bytes:
 
 
 class Pending(Struct, frozen=True):
-    """A stop that an owner has not confirmed. ``first``: when it was first forwarded; ``at``: since when it waits."""
+    """A stop that an owner has not confirmed. ``first``: when it was first forwarded; ``at``: since when it waits.
+
+    ``before``: the owner's state then, if it receives the stop without its name: a greater count confirms it, too.
+    """
 
     stop: EstopCommand
     first: float
     at: float
+    before: EstopState | None
+
+    def is_counted(self, state: EstopState) -> bool:
+        return self.before is not None and self.before.boot == state.boot and state.count > self.before.count
 
 
 class Owner:
@@ -75,7 +82,8 @@ class Owner:
         )
         if was_stopped and not state.latched:
             self.freed_at = now
-        if self.pending is not None and self.confirms(str(self.pending.stop.stop)):
+        pending = self.pending
+        if pending is not None and (self.confirms(str(pending.stop.stop)) or pending.is_counted(state)):
             self.pending = None
 
 
@@ -93,9 +101,10 @@ class PassedStops:
         """Stops that are not confirmed, by owner."""
         return {key: owner.pending for key, owner in self._owners.items() if owner.pending is not None}
 
-    def accept(self, payload: bytes) -> list[bytes]:
+    def accept(self, payload: bytes, *, nameless: bool = False) -> list[bytes]:
         """Remember a named stop as forwarded, and let owners confirm it; return the payloads to publish.
 
+        ``nameless``: the owners receive it from its sender, too, without this name.
         An owner that was reset after the stop was first forwarded gets a copy only if it has yet to confirm the stop.
         """
         if not payload:
@@ -113,7 +122,7 @@ class PassedStops:
             for key, owner in self._owners.items():  # of each owner the newest stop stays pending
                 has_newer = owner.pending is not None and owner.pending.first > first
                 if key not in waiting and not has_newer and not owner.confirms(name):
-                    owner.pending = Pending(stop, first, now)
+                    owner.pending = Pending(stop, first, now, owner.state if nameless else None)
         return [payload]
 
     def follow(self, owner: str, state: EstopState | None) -> None:
