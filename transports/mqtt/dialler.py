@@ -82,8 +82,8 @@ class Dialler:
         return connection
 
     def _make(self, will: Message | None, owner: Owner, counters: Counters, *, as_published: bool) -> Connection:
-        assert self._address is not None  # noqa: S101 - both callers run at an address
-        assert self._credentials is not None  # noqa: S101 - and while it is open
+        assert self._address is not None  # noqa: S101 - `begin` has set it
+        assert self._credentials is not None  # noqa: S101 - `open` has set it
         segment = SMALL_SEGMENT if self.loses_large else self._settings.max_segment
         settings = replace(self._settings, password=self._credentials.password(), max_segment=segment)
         self.attempt = Connection(

@@ -67,7 +67,7 @@ class BrokerDelay:
 
     def __init__(self) -> None:
         self._pings: deque[_Ping] = deque()  # oldest first
-        self._read_answer = self._delivered_answer = 0.0, 0.0  # when its ping was sent, and how long it took
+        self._read_answer = self._delivered_answer = 0.0, 0.0  # ping sent at, took; the second as at `delivered`
         self._shortest = _FAR_S
         self._newest = 0.0  # seconds that the newest answer took; 0: it tells nothing
         self._came_at = 0.0  # when something was received last

@@ -125,7 +125,7 @@ class MqttTransport(Transport):
 
     def _send(self, message: Message, urgent: bool) -> bool:
         connection = self._connection
-        if connection is None or not (self._state is State.CONNECTED or self._own.syncing):
+        if connection is None or not (self._state is State.CONNECTED or self._own.syncing):  # see `_initial_sync`
             return False
         if not connection.takes(message):
             why = f"{len(message.payload)} bytes, but it takes packets of {connection.max_packet} at most"
@@ -135,7 +135,7 @@ class MqttTransport(Transport):
         if self._refused.withheld and not self._refused.admits(message, time.monotonic()):
             self.counters.add("withheld")
             return True  # here, too
-        expires_s = ceil(self.settings.silence_s) if urgent and not message.retain else None
+        expires_s = ceil(self.settings.silence_s) if urgent and not message.retain else None  # later it is stale
         if message.retain:
             self._own_message_filter.note_own(message)
         return connection.publish(message, expires_s=expires_s)
@@ -162,17 +162,17 @@ class MqttTransport(Transport):
             for ack in acks:
                 ack.wait(deadline - time.monotonic())
 
-    def ask(self, topics: Collection[str]) -> None:
+    def ask(self, topics: Collection[str]) -> None:  # by subscribing to each exact topic until the answer has come
         deadline = time.monotonic() + _ANSWER_S
         with self._filters.lock:
-            connection, names = self._connection, [topic for topic in topics if topic not in self._filters]
-            if connection is None or not names:
+            connection, unheard = self._connection, [topic for topic in topics if topic not in self._filters]
+            if connection is None or not unheard:
                 return
-            for name in names:
-                self._own_message_filter.subscribe_again(name)
+            for topic in unheard:
+                self._own_message_filter.subscribe_again(topic)
             # Retained messages come after the SUBACK; the ping's answer follows them.
-            answer = connection.subscribe([(name, self._no_local(name)) for name in names], QoS.LATEST)
-            acks = [answer, connection.ping(), connection.unsubscribe(names)]
+            answer = connection.subscribe([(topic, self._no_local(topic)) for topic in unheard], QoS.LATEST)
+            acks = [answer, connection.ping(), connection.unsubscribe(unheard)]
         for ack in acks:
             ack.wait(deadline - time.monotonic())
 

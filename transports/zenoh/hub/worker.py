@@ -86,7 +86,7 @@ class HubWorker:
             if (task := self._intake.take(self._pause())) is None:
                 return
             self._do(task)
-            for query in self._waiting.take(time.monotonic()):
+            for query in self._waiting.take(time.monotonic()):  # nothing is missing for them, or they wait no longer
                 self._intake.ask(self._answer, query)
             self._publish_due_wills()
             if self._journal is not None and time.monotonic() >= self._journal.rewrite_at:
