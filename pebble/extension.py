@@ -37,7 +37,7 @@ T = TypeVar("T")
 
 #: The group of entry points by which a package offers an extension.
 ENTRY_POINTS: Final = "pebble.extensions"
-_IMPORT_S = 60.0  # for a stranger's module: large libraries take half of it on a small board
+_IMPORT_S = 60.0  # for a module of others: large libraries take half of it on a small board
 _SECTION_KEY = re.compile(r"(services\.)?[A-Za-z]\w*", re.ASCII)
 #: Our extensions in the order of their sections, with the keys of a config that belong to each. One that others use
 #: stands before them.
@@ -180,7 +180,7 @@ def ours() -> tuple[Extension, ...]:
         extension = _declared(module)
         if extension is not None and all(need in installed for need in extension.needs):
             installed[extension.name] = extension
-            SERIAL_PROTOCOLS.update(extension.protocols)
+            SERIAL_PROTOCOLS.update(extension.protocols)  # the contract has only the core's
     return tuple(installed.values())
 
 
@@ -212,7 +212,7 @@ def named(
                 _check_parts(extension, section)
         except KeyboardInterrupt:
             raise
-        except BaseException as error:  # noqa: BLE001 - a stranger's module may raise anything, also SystemExit
+        except BaseException as error:  # noqa: BLE001 - a module of others may raise anything, also SystemExit
             missing.append(Missing(name, f"extensions.{name}", _reason(error), drives))
             continue
         if extension.motors and not drives:

@@ -39,7 +39,7 @@ def owner_of(folder: Path, *, nameless: bool = True, there: bool = False) -> Own
                 raise PebbleError(f"{place}: {error.strerror}") from None
             break
         uid = status.st_uid
-        if uid == root or not (nameless or _has_name(uid)):
+        if uid == root or not (nameless or _has_name(uid)):  # root, or a user who does not count
             uid = 0
         if stat.S_ISLNK(status.st_mode):
             if owner.uid or uid:

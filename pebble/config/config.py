@@ -256,7 +256,7 @@ def _guarded(owner: Extension, rule: Check) -> Check:
     def check(reader: Reader, section: Any, path: problems.Path) -> Any:
         try:
             checked = rule(reader, section, path)
-        except Exception as error:  # noqa: BLE001 - a stranger's
+        except Exception as error:  # noqa: BLE001 - it is code of others
             problem = f"failed: {type(error).__name__}: {error}"
         else:
             if isinstance(checked, type(section)):

@@ -73,7 +73,7 @@ def decode(channel: Channel, raw: bytes, remark: Remark | None = None) -> Any:
     try:
         return msgspec.convert(decoded, channel.payload)
     except (msgspec.ValidationError, ValueError, OverflowError) as error:
-        # Once more, and slower: numbers may be text (`_drive` always allows that), and a wrong `group` is left out.
+        # Lights once more, slower: numbers may be text (`_drive` reads those of drives), a wrong `group` is left out.
         if issubclass(channel.payload, p.LightsSolid):
             decoded = {key: value for key, value in decoded.items() if key != "group" or isinstance(value, bool)}
             return msgspec.convert(decoded | _numbers(channel, decoded, remark or _ignore), channel.payload)

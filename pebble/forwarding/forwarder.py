@@ -74,7 +74,7 @@ class Mirroring:
         """True if no side sends our own messages back. Otherwise commands would be repeated, even after a stop."""
         if all(state.transport.exact_echo for state in self._sides.values()):  # then echo=False is kept to
             return True
-        if not self._was_refused:
+        if not self._was_refused:  # it is logged once
             self._was_refused = True
             log.error(
                 "remote-mirror is refused: a broker sends our own messages back; use one with bridge mode "
@@ -325,7 +325,7 @@ class Forwarder:
         tells_age = forward.stamped and STAMP_LETTER in message.payload and STAMP in message.payload
         waited_s = self.ages.waited_s(subject, message, account) if tells_age else message.waited_s
         late = waited_s > subject.waits_s and not ends_something(subject, message)
-        # Many late commands show a flood; not those that tell their age, whose senders keep to the pace of the link.
+        # Many late commands show a flood, but not those that tell their age: their senders keep to the link's pace.
         if forward.stamped and not (late and tells_age):
             self.note_age(late)
         return late

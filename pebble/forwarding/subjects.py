@@ -160,7 +160,7 @@ class Subjects(dict[str, Subject | None]):
         except TransportError:
             return None
         if topic.startswith(self._between_robots):
-            return None
+            return None  # such topics are never forwarded
         for addresses in self._addresses:
             channel = addresses.channel(topic)
             if channel is not None:

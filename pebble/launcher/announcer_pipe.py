@@ -77,7 +77,7 @@ class AnnouncerPipe:
         self._retry = None
         self._send_states()
 
-    def _send(self, kind: Kind, message: Message) -> bool:
+    def _send(self, kind: Kind, message: Message) -> bool:  # False: no announcer, no room now, or it is too long
         raw = msgspec.msgpack.encode(Envelope(kind, message))
         if self._socket is None or len(raw) > ENVELOPE_LIMIT:
             return False

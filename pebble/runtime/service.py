@@ -165,7 +165,7 @@ class Service:
         def deliver_direct(message: Message, value: Any, names: dict[str, str]) -> None:
             method(value, self.clock() - message.waited_s, **names)
 
-        deliver = deliver_direct if direct else partial(self._deliver, channel, method)
+        deliver = deliver_direct if direct else partial(self._deliver, channel, method)  # the latter only posts
         receive = self.refusals.reader(channel, deliver, self._remark)
         topic = self.addresses[channel].topic
         return self.transport.subscribe(topic, receive, qos=QoS(channel.default_qos), direct=True)
@@ -251,7 +251,7 @@ class Service:
             if job is not None:
                 job()
             self.timers.run_due(self.clock())
-            self._work.wakes_at = self.timers.next_due
+            self._work.wakes_at = self.timers.next_due  # for `run_if_idle` on other threads
         return job is not None
 
     def _tear_down(self) -> None:

@@ -372,7 +372,7 @@ class MqttBridge(ForwardingService):
         if epoch != self.epoch or self._private.stays(topic):
             return
         if topic == self._stop_topic:
-            if not self._has_passed(message):
+            if not self._has_passed(message):  # by the connection for stops alone
                 self._receive_stop(message)
             return
         self._react(Side.REMOTE, message, self.forwarder.receive(Side.REMOTE, message))
