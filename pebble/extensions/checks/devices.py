@@ -88,7 +88,7 @@ def loudspeaker(config: Config) -> Iterator[CheckResult]:
     commands = []
     if sounds.enabled:
         commands.append(sounds.playback.player_command)
-    if devices.enabled and devices.audio.enabled:
+    if devices.enabled and devices.audio.enabled:  # as for the program that plays voices, see loudspeaker_programs
         commands.append(config.section(Media).audio_receiver.command)
     for name in dict.fromkeys(command[0] for command in commands):
         if shutil.which(name) is not None:

@@ -91,7 +91,8 @@ def access_control(rows: Iterable[tuple[Sequence[str], Iterable[Grant]]]) -> dic
     rules: dict[Grant, dict[str, Any]] = {}
     subjects: list[Mapping[str, Any]] = []
     policies: list[dict[str, Any]] = []
-    for subject, grants in [(LOCAL, EVERYTHING), *((_named(names), grants) for names, grants in rows if names)]:
+    accounts = [(_named(names), grants) for names, grants in rows if names]
+    for subject, grants in [(LOCAL, EVERYTHING), *accounts]:
         granted = [rules.setdefault(grant, _rule(f"r{len(rules)}", grant)) for grant in grants if grant.keys]
         subjects.append(subject)
         policies.append({"rules": [rule["id"] for rule in granted], "subjects": [subject["id"]]})

@@ -199,7 +199,8 @@ def _steering(robot: Observer, driver: Driver) -> CheckResult:
         wheels = _moving_wheels(robot, began)
         if wheels is None:
             return _NOT_SHOWN
-        if [speed * sign > 0 for speed, sign in zip(wheels, signs, strict=False)] != [True, True]:
+        are_right = len(wheels) > 1 and all(speed * sign > 0 for speed, sign in zip(wheels, signs, strict=False))
+        if not are_right:
             sent = f"x {fields.get('x', 0):g}, z {fields['z']:g}"
             if "wrapped" in fields:
                 sent += " within value"

@@ -178,7 +178,7 @@ class Gateway:
                     "robots of a LAN"
                 )
             self._quiet_log.warning(base, "gateway %s carries %s: this one leaves it", other, base)
-            self._end(self.carries & {base})
+            self._end(self.carries & {base})  # it may be heard, but not carried
 
     def _begin(self, now: float) -> None:
         """Begin to carry robots that were heard and that no gateway carries, at most TOGETHER of them."""

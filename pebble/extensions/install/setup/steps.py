@@ -115,7 +115,7 @@ class Job:
         """Raise AnswersError with the keys that still need an answer."""
         answers, secrets = self.answers, self.secrets
         is_known = answers.user is not None and has_user(self.people, answers.user)
-        is_there = {
+        is_settled = {  # given, or not needed
             "id": answers.id is not None,
             "port": answers.port is not None,
             "protocol": answers.protocol is not None or answers.port in (None, NONE),
@@ -127,7 +127,7 @@ class Job:
             "user": answers.user is not None or not self.needs_user,
             "password_file": secrets.password is not None or not self.needs_user or is_known,
         }
-        if missing := [key for key, has_answer in is_there.items() if not has_answer]:
+        if missing := [key for key, settled in is_settled.items() if not settled]:
             raise AnswersError("\n".join(f"{key} is missing: {KEYS[key]}" for key in missing))
 
     # -- the steps
