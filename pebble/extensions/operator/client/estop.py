@@ -70,7 +70,7 @@ class RobotStop:
         self._sent_at = float("-inf")
         self._script_ended = False  # the end of a script was sent
         self._given_up = False
-        self._names_due = False  # due again: after it was sent, capabilities came by which topics name the sender
+        self._names_due = False  # the stop is due again: by capabilities that came after it its topic names the sender
         self._status_topic, self._online_topic = STATUS.topic(base), ONLINE.topic(base)
         self._is_offline = False  # as the newest retained heartbeat says
         self.stamp = 0.0  # the newest stamp of the messages that its broker retains, in epoch seconds
@@ -82,7 +82,8 @@ class RobotStop:
         """Return how far the robot's stop has got; SPARED only if the stop is for all robots, not for named ones."""
         if self.confirmed_s is not None:
             return Progress.CONFIRMED
-        if self.estop.has_capabilities and not (self.estop.available or self.estop.drives or self._order.named):
+        may_move = self.estop.available or self.estop.drives
+        if self.estop.has_capabilities and not may_move and not self._order.named:
             return Progress.SPARED
         if self.estop.old:
             return Progress.OLD

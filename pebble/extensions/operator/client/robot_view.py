@@ -156,7 +156,7 @@ class RobotView:
             self.charging = payload.value
         elif channel is c.AUTONOMY_STATUS:
             self.autonomy = payload
-        else:
+        else:  # a heartbeat
             self._take_announced(message.payload)
             if not message.retain:  # a heartbeat that is retained is no sign of life
                 self.liveness.heartbeat(now, wall - payload.t / 1000, online=payload.online is not False, t=payload.t)

@@ -136,7 +136,7 @@ def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
             transport, names, lambda base: base in sender.robots and sender.robots[base].estop.named
         )
         outbox = _Outbox(transport, sender)
-        outbox.publish()
+        outbox.publish()  # at once, before anything else
         report = _Report(sender, outbox)
         try:
             with _heartbeats(target, every=every) as heartbeats, listening(target, transport) as second:
@@ -144,7 +144,7 @@ def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
                 while not sender.finished:
                     for message in heartbeats.take() if heartbeats else ():
                         sender.receive(message, time.monotonic())
-                    outbox.publish()
+                    outbox.publish()  # to robots that were just heard, before the wait
                     _receive(listener, sender, _until_due(sender, has_heartbeats=heartbeats is not None))
                     outbox.publish()
                     report.connection(
@@ -261,6 +261,7 @@ class _Report:
             _echo(f"there are more than {len(sender.robots)} robots: the others got the stop, NOT CONFIRMED")
 
     def _print(self, *, is_early: bool) -> None:
+        """Print the lines that have changed; ``is_early``: see :func:`_line`."""
         for base, robot in list(self._sender.robots.items()):
             line = _line(robot, is_early=is_early, sent=self._outbox.has_sent(base))
             if line and robot.driveable is not None and robot.driveable.doubt:

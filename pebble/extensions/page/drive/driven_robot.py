@@ -352,7 +352,7 @@ class DrivenRobot:
     def _has_ended(self, wish: Wish, now: float) -> bool:
         """True if the page wants no control any more, and the robot confirms that or has not answered in time."""
         if not wish.client.done:
-            wish.ended_at = float("inf")
+            wish.ended_at = float("inf")  # it may have asked again
             return False
         wish.ended_at = min(wish.ended_at, now)
         state = self.published
