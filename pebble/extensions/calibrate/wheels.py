@@ -142,6 +142,7 @@ class _Session:
     # -- the two kinds
 
     def _straight(self, number: str, sign: int) -> Run:
+        """Drive a straight; return the steps of the wheels with the true movement, by the tag or by the person."""
         name = f"{number}, straight {'there' if sign > 0 else 'back'}"
         wanted, mm = self._wanted, sign * self._wanted.length_m * 1000
         if wanted.truth == "tag":

@@ -253,7 +253,7 @@ class RecordingFile:
             elif op == Op.METADATA:
                 self._metadata.append(at)
             elif op == Op.CHANNEL:
-                self._name(self._record(at), is_certain=False)  # it is outside of chunks
+                self._name(self._record(at), is_certain=False)  # outside of chunks no checksum protects it
 
     def _learn(self, chunk: Chunk) -> None:
         """Note the channels that a chunk declares."""

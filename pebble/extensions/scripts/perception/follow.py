@@ -160,11 +160,12 @@ class Follower:
         return self._search(now)
 
     def _search(self, now: float) -> Command:
+        """Turn to the side where the tag was seen last, and after ``search_reverse_after_s`` to the other one."""
         settings = self.settings
         reverse_s = settings.search_reverse_after_s
         if reverse_s > 0.0 and now - self._side_since > reverse_s:
             self._side = -self._side
             self._side_since = now
-        # A pulse lasts for one or two commands: with more power one could turn past all that the camera sees.
+        # A pulse lasts for one or two commands: with more power it could turn the robot past more than its camera sees.
         x = self._pulses.turn(self._side * settings.turn_power, settings.turn_pulse_s, settings.search_pause_s, now)
         return Command(x, 0.0, "search")

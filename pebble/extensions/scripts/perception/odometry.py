@@ -196,6 +196,7 @@ class Odometry:
         """Add a sample of the hall sensors."""
         self._samples += 1
         settings, (left, right) = self._settings, self._directions.at(now)
+        # Only the left wheel may have a second sensor.
         left_second = None if settings.second_channel == "none" else getattr(values, settings.second_channel)
         left_value, right_value = getattr(values, settings.left_channel), getattr(values, settings.right_channel)
         left_mm = self._left.update(HallSample(left_value, left_second, left.power, left.direction), now)

@@ -252,6 +252,7 @@ def _floor(world: World) -> tuple[Image, _Floats]:
     width = max(room.x_max - room.x_min, room.y_max - room.y_min)
     tiles = max(2, min(64, round(width / _TILE_M)))
     checkers = np.indices((tiles, tiles)).sum(axis=0) % 2
+    # Two shades of grey in turn, and each tile a little lighter by chance.
     shades = 120 + 26 * checkers + 20 * noise(7, tiles * tiles).reshape(tiles, tiles)
     picture = cv2.resize(shades.astype(np.uint8), (_FLOOR_PX, _FLOOR_PX), interpolation=cv2.INTER_NEAREST)
     scale = width / _FLOOR_PX
