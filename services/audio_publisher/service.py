@@ -45,8 +45,8 @@ class AudioPublisher(Service):
         self._meter, self._numbers = RateMeter(), sequence_numbers()
         self._requested = self._known(requested_encoding())
         self._encoder: SoundEncoder | None = None
-        self._made_for: tuple[object, ...] = ()  # encoding, rate and channels
-        self._made_step: Step | None = None
+        self._made_for: tuple[object, ...] = ()  # for what the encoder was made: encoding, rate and channels
+        self._made_step: Step | None = None  # and for which step of the rate control
         self._problem = ""  # why sound is not sent as requested
         self.reduced = ""  # because of a slow connection
         self._reader = FrameReader(self.config.run_dir(), "microphone", sharing=False, depth=_DEPTH)

@@ -60,7 +60,8 @@ class MotorOwners:
         for barred in [state.last_barred for state in self._states.values()]:
             if not newer(run, barred):
                 ahead = (run - barred) & LAST_RUN
-                yield (barred + ahead // 2) & LAST_RUN or LAST_RUN  # half of the way; 0 is no run
+                half_way = (barred + ahead // 2) & LAST_RUN  # newer than ``barred``, and ``run`` is newer than it
+                yield half_way or LAST_RUN  # 0 is no run
 
     @property
     def refusal(self) -> str:

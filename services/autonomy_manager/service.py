@@ -82,6 +82,7 @@ class AutonomyManager(Service):
         self._runner.close(_CLOSE_S)
 
     def on_connected(self) -> None:
+        """At the first connection listen to who has control, and bar the run of a predecessor."""
         if not self._connected_before:
             self._connected_before = True
             self.listen(CONTROL_STATE, self._control)

@@ -55,8 +55,8 @@ class NeighboursService(Service):
         self._estop = RobotEstop(self.config.base)
         begins = partial(begin, self.config.state_file("neighbour-runs"), self._section.commanded)
         self._visit = Visit(begins, self._number, partial(self.publish, DRIVE), self._local_runs)
-        self._received_at: dict[str, float] = {}
-        self._state: Neighbours | None = None
+        self._received_at: dict[str, float] = {}  # by robot: when its state came last, which shows its presence
+        self._state: Neighbours | None = None  # as published to operators last
 
     def start(self) -> None:
         self._lan.open(timeout=0.0)

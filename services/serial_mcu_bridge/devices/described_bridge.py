@@ -84,10 +84,11 @@ class DescribedBridge(SerialService):
         self._conflict_logged = False  # another device has the same uid
         self.device: Device | None = None
         self._published_states: dict[int, tuple[Reading, int]] = {}  # newest of each state interface, its epoch ms
-        self._generic: list[Subscription] = []  # of the device that was described last, connected or not
+        #: To the generic topics, mcu/…, of the device that was described last, connected or not.
+        self._generic: list[Subscription] = []
         self.aliases = AliasUse(self.log, self._peers, self._begin_alias, self._end_alias, self.options.aliases)
-        self._features = _ProvidedFeatures(Notifier())
-        self._timer: Timer | None = None
+        self._features = _ProvidedFeatures(Notifier())  # such as outlets, for the robot's capabilities
+        self._timer: Timer | None = None  # for the next event of the session, or of the peers
 
     def start(self) -> None:
         self.post(self._subscribe)
