@@ -169,7 +169,7 @@ def _switch(command: Any) -> Any:
         if isinstance(value, bool):
             return {**command, "enabled": value}
         if isinstance(value, dict):
-            outer = {key: command[key] for key in ("file", "config", "repeat") if key in command}
+            outer = {key: command[key] for key in ("file", "config", "repeat") if key in command}  # beside ``value``
             return {**outer, **value}
     return command
 

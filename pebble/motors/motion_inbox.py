@@ -100,7 +100,7 @@ class MotionInbox:
             sender = self._control.sender(request)
             waiting = self._requests.pop(sender, None)
             if len(self._requests) >= _REQUESTS:
-                knows = self._control.knows  # of the holder, and of who asks first: any other client gives way
+                knows = self._control.knows  # true of the holder, and of who asks first: another gives way
                 del self._requests[next(key for key, received in self._requests.items() if not knows(received.request))]
                 self.dropped += 1
             waiting_takes_over = waiting is not None and waiting.over  # a renewal must not undo that

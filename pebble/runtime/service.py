@@ -202,7 +202,7 @@ class Service:
             if self._inbox:
                 return False
             job()
-            if self.timers.next_due < work.wakes_at:  # by ``job``: the service's thread must not sleep until then
+            if self.timers.next_due < work.wakes_at:  # ``job`` has set an earlier timer than the service's thread knows
                 self._inbox.wake()
         except Exception as failure:  # noqa: BLE001 - raised again on the service's thread, which it ends
             self.post_first(partial(_fail, failure))

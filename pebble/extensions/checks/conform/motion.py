@@ -246,6 +246,7 @@ def _not_a_number(robot: Observer, _driver: Driver) -> CheckResult:
 
 
 def _clamped(robot: Observer, driver: Driver) -> CheckResult:
+    """Check that no wheel gets more than full power by axes beyond -1..1."""
     began, _ = driver.drive(DRIVES_S / 2, z=9, x=-9)
     wheels = _moving_wheels(robot, began)
     if wheels is None or not _wheel_reports(robot):  # speeds by odometry are good for their signs only
