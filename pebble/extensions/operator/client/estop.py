@@ -82,8 +82,8 @@ class RobotStop:
         """Return how far the robot's stop has got; SPARED only if the stop is for all robots, not for named ones."""
         if self.confirmed_s is not None:
             return Progress.CONFIRMED
-        may_move = self.estop.available or self.estop.drives
-        if self.estop.has_capabilities and not may_move and not self._order.named:
+        # SPARED: by its capabilities it has no motors, neither that a stop holds nor that it drives.
+        if self.estop.has_capabilities and not (self.estop.available or self.estop.drives or self._order.named):
             return Progress.SPARED
         if self.estop.old:
             return Progress.OLD
