@@ -92,7 +92,7 @@ class StatusPublisher:
     def publish_last(self) -> None:
         """Publish the status, which says how all other programs ended, before the announcer stops."""
         if self._pipe.dropped:
-            text = "log records that were not published, because the announcer was away or busy: %d"
+            text = "messages that were not published (too long, or the announcer was away or busy): %d"
             log.info(text, self._pipe.dropped)
         self._publish_status()
 

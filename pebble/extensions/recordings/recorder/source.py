@@ -66,6 +66,7 @@ class Source:
             self._transport.close()
             self._is_modern = False
             self._transport = self._make()
+            self._losses.clear()  # the new one counts from zero
             self._open(0.0)
         fetching = self._fetching
         if fetching is not None and (fetching.is_done or self._wants_fetch):

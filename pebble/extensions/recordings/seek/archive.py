@@ -168,6 +168,8 @@ class Archive:
             file.refresh()
         except (PebbleError, OSError) as error:
             self._failed[path] = str(error).removeprefix(f"{path}: ")
+            if file is not None:
+                file.close()
             return None
         self._failed.pop(path, None)
         self._open[path] = file  # the last one used is the last one closed
