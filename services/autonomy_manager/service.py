@@ -64,7 +64,7 @@ class AutonomyManager(Service):
         self.on_stop(processes.close)
         self._runner = Runner(self, spawn or processes, self._section.stop_timeout_seconds)
         self._offer = Offer(self.config, self.post, self._publish_files, scripts)
-        self._overridden_until = self._refused_until = float("-inf")
+        self._overridden_until = self._refused_until = float("-inf")  # scripts wait for a person; starts are refused
         self._status: AutonomyStatus | None = None
         self._connected_before = False
         self._waiting: Callable[[], None] | None = None  # a start, until its script is listed
@@ -155,11 +155,11 @@ class AutonomyManager(Service):
         self._owners.receive(owner, state)
         if state.latched:
             self._waiting = None
-        run, stopped = self._runner.stoppable, bool(self._owners.refusal)
+        run, stopped = self._runner.stoppable, bool(self._owners.refusal)  # stopped: an owner is latched now
         if run is not None and (why := self._owners.ending(run.number, run.baseline, self._signs)):
             self._runner.stop(why, stopped=stopped)
-        if self._runner.stopped and not stopped:  # it was reset: scripts may start again
-            self._runner.refuse(None)
+        if self._runner.stopped and not stopped:  # its error is a stop, which was reset
+            self._runner.refuse(None)  # scripts may start again
 
     def _control(self, state: ControlState, owner: str) -> None:
         self._owners.receive_control(owner, state)
