@@ -70,7 +70,7 @@ class RobotStop:
         self._sent_at = float("-inf")
         self._script_ended = False  # the end of a script was sent
         self._given_up = False
-        self._names_due = False  # due again: after it was sent, capabilities came by which topics name the sender
+        self._names_due = False  # capabilities came by which topics name the sender: the stop is due again, there
         self._status_topic, self._online_topic = STATUS.topic(base), ONLINE.topic(base)
         self._is_offline = False  # as the newest retained heartbeat says
         self.stamp = 0.0  # the newest stamp of the messages that its broker retains, in epoch seconds
