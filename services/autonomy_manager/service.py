@@ -122,7 +122,7 @@ class AutonomyManager(Service):
         except StartError as error:
             listing = isinstance(error, UnknownScriptError) and not self._offer.complete
             if listing and self.clock() < until:
-                self._wait(partial(self._start_script, file, config, by, until))
+                self._try_again(partial(self._start_script, file, config, by, until))
                 return
             why = f"{error}: scripts are still being listed, try again" if listing else str(error)
             self.log_limited.log("refused", logging.WARNING, "%s", why)
@@ -130,7 +130,7 @@ class AutonomyManager(Service):
         else:
             self._runner.start(wanted)
 
-    def _wait(self, start: Callable[[], None]) -> None:
+    def _try_again(self, start: Callable[[], None]) -> None:
         """Call ``start`` again soon, unless another command, a person who drives or an emergency stop comes first."""
 
         def again() -> None:
