@@ -67,10 +67,10 @@ def mutants(file: str, text: bytes) -> Iterator[Mutant]:
     starts = [0, *itertools.accumulate(map(len, text.splitlines(keepends=True)))]
     numbers: Counter[str] = Counter()
 
-    def walk(node: Any, function: str, statement: int) -> Iterator[Mutant]:
+    def walk(node: Any, function: str, statement_line: int) -> Iterator[Mutant]:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
             function = f"{function}.{node.name}".lstrip(".")
-        statement = node.lineno if isinstance(node, ast.stmt) else statement
+        statement_line = node.lineno if isinstance(node, ast.stmt) else statement_line
         is_log = False
         for operator, part, new in replacements(node):
             is_log = is_log or operator == "log"
@@ -79,16 +79,17 @@ def mutants(file: str, text: bytes) -> Iterator[Mutant]:
             start, end = starts[part.lineno - 1] + part.col_offset, starts[part.end_lineno - 1] + part.end_col_offset
             newlines = text.count(b"\n", start, end) * "\n"  # so that what follows stays on its lines
             replacement = ast.unparse(new) + newlines
-            replacement = replacement if isinstance(new, ast.Constant | ast.Pass) else f"({replacement})"
+            if not isinstance(new, ast.Constant | ast.Pass):  # so that it stays one operand
+                replacement = f"({replacement})"
             change = " ".join(f"{text[start:end].decode()} -> {ast.unparse(new)}".split())
             record = {"name": f"{name}:{numbers[name]}", "file": file, "line": part.lineno, "change": change}
-            reached_by = {(file, line) for line in (statement, *range(part.lineno, part.end_lineno + 1))}
+            reached_by = {(file, line) for line in (statement_line, *range(part.lineno, part.end_lineno + 1))}
             yield record, reached_by, text[:start] + replacement.encode() + text[end:]
         # Annotations and decorators are not mutated, nor what is inside a call that logs or an f-string.
         vars(node).update(annotation=None, returns=None, decorator_list=[])
         if not is_log and not isinstance(node, ast.JoinedStr):
             for child in ast.iter_child_nodes(node):
-                yield from walk(child, function, statement)
+                yield from walk(child, function, statement_line)
 
     return walk(ast.parse(text), "", 0)
 
@@ -251,6 +252,7 @@ class Trial:
         gc.freeze()
         for file, text in self.texts.items():
             possible = script_mutants(file, text) if file.endswith(".js") else mutants(file, text)
+            # A draw: by a hash of the name in each mutant's record, which the seed changes.
             drawn = sorted(possible, key=lambda mutant: crc32(mutant[0]["name"].encode(), self.options.seed))
             report(file, len(drawn), [self.attempt(*mutant) for mutant in drawn[: self.options.n or None]])
         return True

@@ -48,7 +48,7 @@ def _complete(definition: dict[str, Any], kind: type[Section]) -> None:
         if choices:
             properties[field.encode_name]["enum"] = choices
     for value in properties.values():
-        if "$ref" in value or value.get("default", 0) is None:
+        if "$ref" in value or value.get("default", 0) is None:  # a section, or a default that is null
             value.pop("default", None)
         if value.get("items") == {"type": "string"}:
             value["type"] = ["array", "string"]  # words, or one line of them

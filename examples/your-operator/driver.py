@@ -53,7 +53,7 @@ class Driver:
             return "the robot is silent"
         if self.robot.is_stopped() or is_stopping:
             return "the robot is stopped"
-        if self.is_moving and self.robot.gives_control() and not self.robot.key(self.id):
+        if self.is_moving and self.robot.gives_control() and not self.robot.key(self.id):  # it lost the key
             return "another has control now"
         return ""
 

@@ -202,7 +202,7 @@ class NetworkRobot:
             axes = getattr(self.body, "axes", b"")
             text = describe(now_ms, session.root, self.name, stops, self.charging, axes, self.groups)
             session.publish(b"capabilities", text, 1)
-            stops.changed = stops.lease.changed = True
+            stops.changed = stops.lease.changed = True  # on a new connection the states follow, changed or not
             self._due = now  # the first heartbeat
         else:
             self._due = add(self._due, _HEARTBEAT_MS)

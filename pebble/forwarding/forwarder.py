@@ -196,7 +196,7 @@ class Forwarder:
             routed = self._receive_named(source, self._names, message)
         else:
             subject = self.subjects[message.topic]
-            outcome = self.admit(source, subject, message, message.topic, True)
+            outcome = self.admit(source, subject, message, message.topic, True)  # True: no name is needed
             if subject is not None and isinstance(outcome, Forward):
                 outcome = self.pass_on(source, subject, message, outcome, "")
             routed = Routed(subject, outcome)
@@ -288,7 +288,7 @@ class Forwarder:
         for name, step in self._steps.items():
             try:
                 why = step(source.side, subject, message)
-            except Exception as error:  # noqa: BLE001 - whatever a stranger's code raises: it is no refusal
+            except Exception as error:  # noqa: BLE001 - whatever foreign code raises: it is no refusal
                 self._quiet_log.warning(name, "the extension %s failed at %s: %r", name, message.topic[:_LOGGED], error)
                 continue
             if why:
@@ -370,9 +370,9 @@ class Forwarder:
                 self.publisher.probe(side, message.topic, message.payload)
                 return None
             case Finding.RELAY:
-                relayed = Forward(forward.qos, False, forward.urgent)
+                relayed = Forward(forward.qos, False, forward.urgent)  # False: not retained
                 self.publisher.publish(self.sides[side.other], subject, message, relayed)
-        return Drop.PROBE  # also for RELAY: it has been sent on here
+        return Drop.PROBE  # of RELAY, too: that probe was sent on above
 
     def _hold_event(self, target: SideState, message: Message) -> Drop:
         if self.gate is Gate.SHUT:

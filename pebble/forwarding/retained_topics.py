@@ -11,7 +11,7 @@ from pebble.forwarding.side import Gate, Sides, SideState
 from pebble.forwarding.subjects import Subject, Subjects
 from pebble.transports import Message, QoS
 
-_MAX_WAITING = 4096  # retained messages that wait for the gate to open
+_MAX_WAITING = 4096  # retained messages that wait for the gate to open; also topics in `SideState.seen`
 _DROPS = {Resolution.KNOWN: Drop.KNOWN, Resolution.HOLD: Drop.HELD}
 
 

@@ -101,7 +101,7 @@ class Subjects(dict[str, Subject | None]):
         super().__init__()
         self._subject = cache(Subject)
         if isinstance(config, str):
-            self._base, self._thin = config, False
+            self._base, self._thin = config, False  # _thin: see Subject
             self._addresses = [Addresses(config)]
         else:
             self._base, self._thin = config.base, config.services.mqtt_bridge.link.profile != "wide"
@@ -109,7 +109,7 @@ class Subjects(dict[str, Subject | None]):
             self._addresses = [Addresses(view_of(config, instance)) for instance in instances]
         self._between_robots = tuple(f"{self._base}/{family}" for family in BETWEEN_ROBOTS)
         self._incoming = f"{self._base}/{INCOMING}/".encode()
-        topics = (topic.encode() for topic in self.topics(*CHANNELS))
+        topics = (topic.encode() for topic in self.topics(*CHANNELS))  # those elsewhere stay whole, unlike any metric
         self._known_metrics = frozenset(topic.removeprefix(self._incoming) for topic in topics)
 
     def __missing__(self, topic: str) -> Subject | None:

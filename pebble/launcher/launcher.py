@@ -183,7 +183,7 @@ class Launcher:
     def _stop_stage(self, supervisors: Sequence[ProcessSupervisor], limit_s: float) -> None:
         for supervisor in supervisors:
             supervisor.stop()
-        if self._signals.received > 1:
+        if self._signals.received > 1:  # a second one asks to end at once
             self._kill_all()
         if not self._reactor.run_until(lambda: not _running(supervisors), limit_s):
             log.warning("did not stop in time: %s", ", ".join(_running(supervisors)))

@@ -306,7 +306,7 @@ class MotorOwner(Service, ABC):
             self.addresses[c.ESTOP].topic,
             self.addresses[c.ESTOP_RESET].topic,
         )
-        self.retract(c.ESTOP_STATE, owner=self.owner)
+        self.retract(c.ESTOP_STATE, owner=self.owner)  # without a state it has no emergency stop
 
     # -- the guard
 

@@ -104,7 +104,7 @@ class Service:
         self.timers = Timers()
         self.log_limited = RateLimitedLog(self.log)
         self.refusals = Refusals(self.log_limited, self.counters)
-        self._remarks = RateLimitedLog(self.log, period_s=60.0, most=_SENDERS)
+        self._remarks = RateLimitedLog(self.log, period_s=60.0, most=_SENDERS)  # on commands that are carried out
         self._inbox = Inbox()
         self._work = WorkLock()
         self._states: dict[str, tuple[Channel, bytes]] = {}  # the newest ones, by topic, to be published again

@@ -203,7 +203,7 @@ class Catalogue:
             return _Answer(described, problem=str(error), broken=True)
         if not ours or not self._asks:  # this catalogue never runs a script
             return _Answer(described, ours, problem)
-        if not asks:
+        if not asks:  # it is ours, and is asked later
             return _Answer(described, True, problem, asked=False)
         command = self._command(folder, entry, section, described, ours=True)
         try:

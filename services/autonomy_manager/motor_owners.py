@@ -89,7 +89,7 @@ class MotorOwners:
             # An owner bars all runs up to a number: that before a run that begins, or the newest as a person drives.
             is_barred = state.last_barred != barred and not newer(run, state.last_barred)
             if signs and is_barred:
-                newer_began = state.last_barred != run or newer(self.newest_run, run)  # != : a later one
+                newer_began = state.last_barred != run or newer(self.newest_run, run)  # it is barred, or was received
                 return SUPERSEDED if newer_began else OVERRIDDEN
             if state.boot != boot:
                 return f"motor owner {owner} was restarted: start the script again"

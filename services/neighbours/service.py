@@ -167,7 +167,7 @@ class NeighboursService(Service):
             try:
                 return next_run(self.config, barred, received) if free else None
             except PebbleError as error:
-                self.log_limited.log("number", 30, "%s", error)
+                self.log_limited.log("number", 30, "%s", error)  # a warning
                 return None
 
     def _local_runs(self) -> bool:

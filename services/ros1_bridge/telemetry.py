@@ -179,6 +179,7 @@ class Telemetry:
             self._battery(part, _stamp(header))
 
     def _battery(self, part: Health, stamp: float) -> None:
+        """Publish the level and the status of charging that this part of the diagnostics has, each if it is due."""
         level, status = self._metrics.charging_level, self._metrics.charging_status
         if part.name == level.status_name and level.key in part.values:
             number = float(part.values[level.key])

@@ -170,7 +170,7 @@ class Connection:
             if now >= self.pings.due_at:
                 self.pings.send(client)
             owes = client.owes
-            if not owes:
+            if not owes:  # otherwise MQTT's acknowledgements carry TCP's
                 self._quick_ack()
             messages, incoming.messages = incoming.messages, []
             answers = incoming.answers
@@ -262,7 +262,7 @@ class Connection:
             if not limits.qos and client.unwritten > _UNWRITTEN and not self._owner.policy.is_stop(message.topic):
                 return False
             if message.retain and limits.retain:
-                self.in_flight.accept(message)
+                self.in_flight.accept(message)  # so that it is known while the broker has not confirmed it
             if message.qos is QoS.LATEST and client.waiting:
                 self._counters.add("dropped", self._backlog.put(message))
             else:

@@ -94,13 +94,13 @@ class BrokerDelay:
             took_s = now - ping.sent_at
             self._read_answer = ping.sent_at, took_s
             self._newest = took_s if ping.clear else 0.0  # else our own data held up the ping
-            self.usual(took_s)
+            self.usual(took_s)  # if it is the shortest
         is_near = self._shortest <= _NEAR_S  # else the answer to an older ping, too, may come soon after the newest one
         if is_near and self._pings and now - self._pings[-1].sent_at <= self._shortest + _NEAR_S:
             self._prompt += 1
         else:
             self._prompt = 0
-        if self._prompt >= _LOST:  # these answers belong to the newest pings: no ping is unanswered
+        if self._prompt >= _LOST:  # each was for the newest ping: earlier answers are lost, none is to come
             self._pings.clear()
             self._newest = 0.0
 

@@ -60,8 +60,8 @@ class MqttTransport(Transport):
         if settings.protocol not in ("3.1.1", "5"):
             raise TransportError(f'protocol must be "3.1.1" or "5", not "{settings.protocol}"')
         self.settings = settings
-        self.as_published = settings.as_published
-        self.exact_echo = settings.as_published or settings.protocol == "5"
+        self.as_published = settings.as_published  # in bridge mode on 3.1.1, which also keeps own messages away
+        self.exact_echo = settings.as_published or settings.protocol == "5"  # 5 has noLocal for that
         self._dialler = Dialler(client_id, settings, will, self.client_class)
         self._connection: Connection | None = None  # the newest one, once it can be used
         self._filters = BrokerFilters()
@@ -157,7 +157,7 @@ class MqttTransport(Transport):
                 return  # the next connection subscribes to them
             # Retained messages come after the SUBACK, on a bad network long after it; a ping's answer follows them.
             acks.append(connection.ping())
-        if self._network is None or threading.current_thread() is not self._network.thread:  # which reads the answers
+        if self._network is None or threading.current_thread() is not self._network.thread:  # it reads the answers
             deadline = time.monotonic() + _ANSWER_S
             for ack in acks:
                 ack.wait(deadline - time.monotonic())
@@ -280,7 +280,7 @@ class MqttTransport(Transport):
         """Send retained messages that were withheld, where a new attempt is due: the broker may refuse their topics."""
         with self._publishing:
             for message in self._refused.due(self._own, connection.where, time.monotonic()):
-                self._own.remember(message, sent=self._send(message, False))
+                self._own.remember(message, sent=self._send(message, False))  # not urgent
 
     def _report_limits(self, connection: Connection) -> None:
         limits = connection.limits

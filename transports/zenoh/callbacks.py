@@ -104,7 +104,7 @@ class Guard:
             if quiet < _REST:
                 continue
             self.rests = True
-            if not self._look():  # else a callback has begun that did not see it
+            if not self._look():  # else a callback has begun before `rests` was set, and woke no guard
                 self._wakeup.wait(None)
             self.rests, quiet = False, 0
 

@@ -40,7 +40,7 @@ class CheckedNames(Names):
         self._below = f"{base}/{INCOMING}/{BY}/"
         self._subjects = subjects
         rights = () if strangers == "refuse" else (Right.LOOK, Right.DRIVE)
-        self._strangers = frozenset(
+        self._strangers = frozenset(  # channels that senders without an account may write
             channel.suffix for right in rights for channel in WRITES[right] if isinstance(channel, Channel)
         )
 

@@ -211,7 +211,7 @@ class JitterBuffer:
             self.counters.add("jumps")
         elif missing:
             self.counters.add("lost", missing)
-        elif self._concealed and self._last is not None:  # the packet came late: estimated sound took its time
+        elif self._concealed and self._last is not None:  # the packet came late, after estimated sound in its place
             self._depth.late(self._concealed / self._last.rate, now)
         return self._play(number, now)
 

@@ -264,7 +264,7 @@ class Control:
         if not self._may("reset", op) or robot is None:
             return
         reset = Reset(robot.estop, self._session.user)
-        known, reset.shown = reset.shown, {}
+        known, reset.shown = reset.shown, {}  # refilled with the stops that the page has shown
         for shown in op.owners:
             if shown.owner in known:
                 reset.shown[shown.owner] = replace(known[shown.owner], boot=shown.boot, count=shown.count)

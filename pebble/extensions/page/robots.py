@@ -250,7 +250,8 @@ class Robots:
         """Send values that change with time. Call this every 0.25 s.
 
         Whether a component is online is sent at once. Ages are sent each second for open components. The others take
-        turns, at most a third of them at once and _REFRESHES_PER_S a second, so that a thousand robots cause no flood.
+        turns, each every ``turn_s``: so they are _REFRESHES_PER_S a second, and a thousand robots cause no flood. At
+        most a third of these are sent in one call.
         """
         due: list[Component] = []
         opened = {interest.watched for interest in self.interests}

@@ -80,14 +80,14 @@ class SilentBoards:
         board = self._boards.get(op.ref)
         if board is None or board.permission is None:
             return "It is no board that does not say what it can do"
-        if op.do == "clear":
+        if op.do == "clear":  # it changes no permission
             sent = self._broker.publish(DRIVE.topic(op.ref), b"", retain=True, remember=False)
             return "" if sent else "The server cannot reach the broker"
         if why := self._refusal(op.ref):
             return why
         axes: tuple[str, ...] = ()  # "withdraw"
         if op.do == "allow":
-            axes = (*AXES, "y") if op.extra else AXES
+            axes = (*AXES, "y") if op.extra else AXES  # extra: the board has this axis, too
         permission = Permission(user, axes, time.time())
         self._people.set(_SETTING + op.ref, msgspec.json.encode(permission).decode())
         board.permission = permission

@@ -107,7 +107,9 @@ def _moment(option: str, text: str, now: datetime, days: int = 0) -> int:
     except ValueError:
         _refuse(option, text)
     moment = moment if moment.tzinfo is not None else moment.replace(tzinfo=now.tzinfo)
-    return _ns(moment + days * _DAY if _is_day(text) and moment.date() < date.max else moment)
+    if _is_day(text) and moment.date() < date.max:  # there is no day after date.max
+        moment += days * _DAY
+    return _ns(moment)
 
 
 def _is_day(text: str) -> bool:

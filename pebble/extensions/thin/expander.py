@@ -61,7 +61,7 @@ class Expander:
         """Subscribe, first to announcements: they tell which expander works."""
         for suffix, receive in (
             (EXPANDER.suffix, self._receive_announcement),
-            (f"{INCOMING}/{BY}/+/{EXPANDER.metric}", self._receive_announcement),
+            (f"{INCOMING}/{BY}/+/{EXPANDER.metric}", self._receive_announcement),  # to robots that check names
             (WIRE.suffix, self._receive_wire),
             (STREAMS.suffix, self._receive_group),
         ):

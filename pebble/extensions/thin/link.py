@@ -94,7 +94,7 @@ class LinkMeter:
         thin = profile == "thin" or (profile == "auto" and kbit is not None and kbit < _LITTLE_KBIT)
         self.level: LinkLevel = "thin" if thin else "wide"
         self.queue_s = 0.0
-        self._fixed = thin or profile != "auto"
+        self._fixed = thin or profile != "auto"  # the level never changes
         self._answer_number, self._answered_at = 0, -inf  # of the newest answer, and when an answer last counted
         self._shortest = ShortestTrip()
         self._newest: deque[float] = deque(maxlen=3)  # queues that were measured at this level

@@ -61,7 +61,10 @@ class Sieve:
         return len(self._waiting)
 
     def takes_event(self, message: Message) -> bool:
-        """Return True if an event may be sent now. False: it stays in its buffer, and its waiting time is noted."""
+        """Return True if an event may be sent now, with as much room as a state may use.
+
+        False: it stays in its buffer, and its waiting time is noted.
+        """
         goes_before_states = self._event_is_overdue or Rank.STATE not in self._ranks_that_wait
         if goes_before_states and self._takes(Rank.STATE, _size(message)):
             self._event_waits_since = inf

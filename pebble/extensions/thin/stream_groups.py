@@ -105,7 +105,7 @@ class StreamGroups:
         now = self._clock()
         if not self._is_announced:
             self._publish_wire()
-        if now - self._heard_at > HEARD_S:
+        if now - self._heard_at > HEARD_S:  # no expander would split them
             with self._lock:
                 self._waiting.clear()
             return

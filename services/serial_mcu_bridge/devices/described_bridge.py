@@ -166,7 +166,7 @@ class DescribedBridge(SerialService):
         device, now_ms = self.device, _now_ms()
         is_motion = reading.interface.profile == MOTION
         has_motion = device is not None and device.has_motion
-        if is_motion or not has_motion:  # others go on if the inertial sensor fails
+        if is_motion or not has_motion:  # other readings do not show that the inertial sensor works
             self.watchdog.sample(self.clock())
         if is_motion:
             self.sensors.take(measured(reading.values), self.clock())
@@ -212,6 +212,7 @@ class DescribedBridge(SerialService):
             self.log.warning(text, uid)
 
     def _publish_device(self, manifest: Manifest) -> None:
+        """Receive the commands of a device that has described itself, and publish what it is."""
         device = self.device = Device(manifest, self.addresses, ImuReports(self.options, self.instance))
         hello = device.hello
         self.log.info("%s: %r, firmware %r, %d interfaces", device.uid, hello.model, hello.firmware_version,
@@ -227,8 +228,8 @@ class DescribedBridge(SerialService):
         self._listen_generic(device, private=False)  # a reader of the manifest may send commands at once
         self.publish(MCU_LOCAL_ONLY, device.local_only, uid=device.uid)
         self.publish(MCU_DESCRIBE, device.payload, uid=device.uid)
-        self.publish(MCU_COMMAND, {"from": self._token}, uid=device.uid, name=RESERVED)  # a _UID_QUERY, with a token
-        self._listen_generic(device, private=True)  # only now, as bridges have been told that these stay here
+        self.publish(MCU_COMMAND, {"from": self._token}, uid=device.uid, name=RESERVED)  # _UID_QUERY: who else has it?
+        self._listen_generic(device, private=True)  # after the list by which bridges keep these on the robot
         self.aliases.announce(device)
         self.call_at(self.clock() + CLAIM_S, partial(self.aliases.permit, device))
 
@@ -305,6 +306,7 @@ class DescribedBridge(SerialService):
         self.log_limited.warning("command", "refused a command: %s", why)
 
     def _begin_alias(self, device: Device, route: Route, alias: Alias) -> Subscription | None:
+        """Return the subscription to an alias for commands; on any other alias publish the newest state."""
         self._features.names |= outlet_feature(alias.claim)
         if route.interface.direction is Direction.IN:
             return self.listen(alias.channel, partial(self._command, device, route))
@@ -329,7 +331,7 @@ class DescribedBridge(SerialService):
             self.transport.subscribe(self.addresses[GROUP].topic, receive, qos=QoS.DELIVERED, direct=True)
 
     def _on_manifest(self, message: Message) -> None:
-        """Handle the manifest of any device, on the transport's thread."""
+        """Handle the manifest of any device, on the transport's thread. A wrong one is left out."""
         uid = MCU_DESCRIBE.names(message.topic).get("uid")
         if uid is None:  # the filter's + also matches an empty level
             self.counters.add("refused")

@@ -66,6 +66,7 @@ def check(
 
 
 def _check(path: Path, *, as_json: bool, first: bool) -> bool:
+    """Print a config's summary or its problems; return False if it has problems. The schema is passed over."""
     if path.name == SCHEMA:
         typer.echo(f"pebble: {path.name}: the JSON Schema of configs, not a config", err=True)
         return True

@@ -180,6 +180,7 @@ def capabilities(robot: Observer) -> CheckResult:
 
 
 def own_topics(robot: Observer) -> CheckResult:
+    """Check that all topics in the capabilities are the robot's own, and valid."""
     foreign = {
         f"{path} is {topic}"
         for path, topic in _topics(robot.view.capabilities, "")

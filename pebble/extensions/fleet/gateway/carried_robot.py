@@ -45,7 +45,7 @@ class NamedSubjects(Subjects):
         subject = None if plain is None else super()._find(plain)
         if subject is None or subject.kind is not Kind.FLAG:
             return subject
-        return self._subject(Kind.COMMAND, subject.channel, subject.qos)  # nothing is retained behind a name
+        return self._subject(Kind.COMMAND, subject.channel, subject.qos)  # with a name it is not retained
 
 
 class Beginning:

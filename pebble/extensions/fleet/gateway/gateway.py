@@ -195,7 +195,7 @@ class Gateway:
             for base in waiting[:TOGETHER]
         ]
         for transport in (hub, broker):
-            transport.policy.is_stop = is_stop  # instead of the newest forwarder's, which knows its own robot
+            transport.policy.is_stop = is_stop  # each Forwarder has set it for its own robot only
         self._has_begun = True
         self._carried |= {robot.base: robot for robot in robots}
         with self._beginning:  # measures how long this takes
@@ -245,6 +245,7 @@ class Gateway:
         return self._first.setdefault(base, heartbeat) != heartbeat
 
     def _on_gateway(self, message: Message) -> None:
+        """Note a gateway's heartbeat, or its end, an empty message. A retained one shows no live gateway."""
         address = parse_topic(message.topic)
         if address is None:
             return

@@ -185,6 +185,7 @@ class Job:
             "accounts, rules and certificate of the robot's own broker",
             lambda: folder.is_dir() and own_broker.knows(folder, wanted, passwords()),
             make_or_change,
+            # `change` makes a running broker read its files at once; after `make` it has to be restarted.
             (ROBOT_SERVICE,) if folder.is_dir() else (BROKER_SERVICE, ROBOT_SERVICE),
         )
         yield self._file(
@@ -266,11 +267,11 @@ class Job:
         """
         unfinished = self.places.unfinished
         services = {service for step in steps for service in step.restarts}
-        if unfinished.exists():
+        if unfinished.exists():  # of a setup that failed before its restarts, or of a backup that was restored
             services |= {ROBOT_SERVICE, *([BROKER_SERVICE] if self.answers.broker == HERE else [])}
         try:
             for step in steps:
-                if not unfinished.exists():
+                if not unfinished.exists():  # written with the first step: without any, nothing is unfinished
                     self.system.write(unfinished, b"")
                 step.do()
             for service in (BROKER_SERVICE, ROBOT_SERVICE):

@@ -377,7 +377,7 @@ class Operator:
             self._hold(_BACK, _OVERRIDE_S)
             released = self._drive(STOP)
             self.show(f"LETS GO: {robot.name} waits {HOLD_S:.0f} s for another command")
-            self._wait(HOLD_S - _BEFORE_SCRIPT_S)
+            self._wait(HOLD_S - _BEFORE_SCRIPT_S)  # the record of the command ends while nothing moves the robot
             self._complete(TAKE_OVER, _BACK, took_over, released, time.monotonic())
             self._until(script_drives, _STATUS_S)
             self.show(f"GIVES BACK: {FOLLOW} drives {robot.name} again")

@@ -59,7 +59,7 @@ class View:
             yield
         except OSError:
             self._notice_closed_terminal()
-            is_closed = self._console.quiet
+            is_closed = self._console.quiet  # see _notice_closed_terminal
             if not is_closed:
                 raise
 

@@ -70,7 +70,7 @@ class RobotStop:
         self._sent_at = float("-inf")
         self._script_ended = False  # the end of a script was sent
         self._given_up = False
-        self._names_due = False  # capabilities came by which topics name the sender: the stop is due again, there
+        self._names_due = False  # to be sent again: newer capabilities say that topics name the sender
         self._status_topic, self._online_topic = STATUS.topic(base), ONLINE.topic(base)
         self._is_offline = False  # as the newest retained heartbeat says
         self.stamp = 0.0  # the newest stamp of the messages that its broker retains, in epoch seconds
@@ -182,7 +182,7 @@ class RobotStop:
             return []
         self._sent_at, self.next, self._names_due = now, now + REPEAT_S, False
         estop, messages = self.estop, []
-        if not estop.old:
+        if not estop.old:  # old: it is known to have no emergency stop
             messages.append(_message(ESTOP, ESTOP.topic(estop.base), self._order.payload))
         cannot_latch = estop.old or bool(estop.zeros)
         if cannot_latch and not self._script_ended:  # else the script would drive on between two zeros

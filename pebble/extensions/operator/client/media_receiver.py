@@ -29,10 +29,10 @@ class MediaReceiver:
         self.pictures, self.sounds = RateMeter(), RateMeter()
         self.encoding: dict[Medium, str] = {}  # of the last payload
         self._video, self._audio = VideoDecoder(), SoundDecoder()
-        self.requests: dict[Medium, ViewerRequest] = {}
+        self.requests: dict[Medium, ViewerRequest] = {}  # made by :meth:`request`
         self._transport = transport
         self._subscriptions: list[Subscription] = []
-        self._is_known = threading.Event()
+        self._is_known = threading.Event()  # capabilities have arrived
         self._subscriptions.append(transport.subscribe(CAPABILITIES.topic(base), self._on_capabilities))
 
     def wait_for_capabilities(self, timeout: float) -> None:

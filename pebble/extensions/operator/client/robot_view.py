@@ -33,9 +33,9 @@ class Liveness:
         self.received_at: float | None = None  # monotonic
         self.reported_offline = False
         self.link: LinkLevel = "wide"  # as its bridge measures it
-        self._intervals: deque[float] = deque(maxlen=_HISTORY)
-        self._latencies: deque[float] = deque(maxlen=_HISTORY)
-        self._stamps: deque[int] = deque(maxlen=_STAMPS)
+        self._intervals: deque[float] = deque(maxlen=_HISTORY)  # between the newest heartbeats
+        self._latencies: deque[float] = deque(maxlen=_HISTORY)  # of the newest with a plausible time
+        self._stamps: deque[int] = deque(maxlen=_STAMPS)  # times in the newest, ms of its clock
         self.latency_s: float | None = None  # of the newest heartbeat; None if its clock is wrong
         self._returns: deque[float] = deque(maxlen=2)  # when a heartbeat came after people had been told of a silence
 

@@ -203,7 +203,7 @@ class Telemetry:
     def _localization(self, _topic: str, payload: bytes) -> Converted | None:
         """Convert the pose of a ROS robot: metres and radians in the frame that it names."""
         pose = codec.plain(c.LOCALIZATION_POSE, payload)
-        value = pose.get("value", pose) if isinstance(pose, dict) else None
+        value = pose.get("value", pose) if isinstance(pose, dict) else None  # wrapped in ``value`` or not
         if not isinstance(value, dict):
             return None
         x, y = _number(value, "x_m"), _number(value, "y_m")
@@ -277,7 +277,7 @@ def as_object(payload: bytes) -> bytes | None:
     """
     payload = codec.trim(payload)
     try:
-        payload.decode()
+        payload.decode()  # raises if it is not UTF-8
         value = msgspec.json.decode(payload)
     except (UnicodeDecodeError, msgspec.DecodeError, RecursionError):
         return None

@@ -123,7 +123,8 @@ class Archive:
         for named in self._list():
             if named.lane.startswith(MEDIA) and named.lane not in media_lanes:
                 continue
-            if named.begins_ns and not since_ns - _LONGEST_FILE_NS <= named.begins_ns < until_ns:
+            may_overlap = since_ns - _LONGEST_FILE_NS <= named.begins_ns < until_ns
+            if named.begins_ns and not may_overlap:  # 0: the name does not tell when it begins
                 continue
             file = self._opened(named.path)
             if file is None or not file.chunks or file.first_ns >= until_ns or file.last_ns < since_ns:
@@ -235,6 +236,7 @@ def _is_of(channel: Channel, robot: str) -> bool:
 
 
 def _named(path: Path) -> _Named:
+    """Return the file with the facts that its name tells; a file with another name may hold anything."""
     match = NAME.fullmatch(path.name)
     if match is None:
         return _Named(path, "", 0)

@@ -165,7 +165,7 @@ class _Rows:
         activity = self._activities.get(channel)
         if activity is None:
             activity = self._declare(message.channel)
-        stamp = message.publish_ns if message.publish_ns <= _LATEST_NS else 0
+        stamp = message.publish_ns if message.publish_ns <= _LATEST_NS else 0  # later ones cannot be stored
         medium, online = 0, -1  # of no media, and no heartbeat
         if payload.startswith(PBAT):
             medium = SOUND

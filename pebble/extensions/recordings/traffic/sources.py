@@ -61,6 +61,7 @@ def sources(places: Iterable[Path], scratch: Path, progress: Progress = lambda _
 def _indexes(
     places: Iterable[Path], scratch: Path, connection: DuckDBPyConnection, progress: Progress
 ) -> Iterator[Path]:
+    """Yield the index of each recording; progress counts their bytes."""
     paths = list(dict.fromkeys(path.resolve() for path in files(places)))
     sizes = [path.stat().st_size if path.exists() else 0 for path in paths]
     done, total = 0, max(1, sum(sizes))

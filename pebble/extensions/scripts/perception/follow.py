@@ -112,6 +112,7 @@ class Follower:
         return self._last
 
     def _with_tag(self, now: float, place: Place) -> Command:
+        """Return a command for a visible tag: turn to it if it is outside of the cone, else drive to the distance."""
         self._seen_at = self._side_since = now
         self._near = place.distance_m < self.settings.target_distance_m + _NEAR_M
         self._side = math.copysign(1.0, place.angle_rad)
