@@ -436,9 +436,11 @@ def _of_file(path: Path) -> Extension:
     if not path.is_file():
         raise PebbleError(f"there is no file {path}")
     if hasattr(os, "getuid") and os.getuid() == 0:
-        # Who may write in a folder may replace the file: in that of a link, and in that of the file behind it.
-        folders = (path.parent, path.resolve().parent)
-        uid = path.stat().st_uid or max(owner_of(folder, nameless=False).uid for folder in folders)
+        uid = path.stat().st_uid
+        if not uid:
+            # Who may write in a folder may replace the file: in that of a link, and in that of the file behind it.
+            folders = (path.parent, path.resolve().parent)
+            uid = max(owner_of(folder, nameless=False).uid for folder in folders)
         if uid:
             why = "and root runs no code of other users: chown root it, in a folder of root's"
             raise PebbleError(f"{path} belongs to user {uid}, {why}")
@@ -447,7 +449,7 @@ def _of_file(path: Path) -> Extension:
         raise PebbleError(f'a module has no "." in its name: rename the file {path.name}')
     if str(path.parent) not in sys.path:
         sys.path.append(str(path.parent))  # its process runs it by name; last, so that it hides nothing
-    origin = Path(getattr(find_spec(name), "origin", None) or "")
+    origin = Path(getattr(find_spec(name), "origin", None) or "")  # the file that importing the name would run
     if not (origin.is_file() and origin.samefile(path)):
         raise PebbleError(f"a module is called {name} already: rename the file")
     if not re.search(r"\bEXTENSION\b", path.read_text(encoding="utf-8", errors="replace")):

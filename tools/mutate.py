@@ -197,9 +197,11 @@ class Trial:
     """A plugin for pytest that runs the collected rows without a mutant, and with each, in a copy of the tree."""
 
     def __init__(self, files: list[str], tests: list[str], work: Path, options: argparse.Namespace) -> None:
+        # The copy of the tree, and files in which child processes note the rows that failed, and those that passed.
         self.tree, self.failed, self.passed, self.options = work / "tree", work / "failed", work / "passed", options
         self.texts = {file: (ROOT / file).read_bytes() for file in files}
         self.file_of = functools.cache(lambda path: os.path.relpath(os.path.realpath(path), self.tree))
+        #: By file, qualified name and first line.
         self.functions: defaultdict[tuple[str, str, int], list[FunctionType]] = defaultdict(list)
         self.arcs: set[tuple[str, int, int]] = set()  # of a row: file, from which line, to which; 0: the function ends
         marks = "page or alone" if options.thorough else "page or alone or thorough"
@@ -308,7 +310,7 @@ class Trial:
         """Run rows with a mutant; write the result, and return it."""
         start, file = time.monotonic(), record["file"]
         script = file.endswith(".js")
-        # Functions whose code a fork can exchange. None: all rows run with the changed file instead.
+        # Functions whose code a fork can exchange. If it is empty, all rows run with the changed file instead.
         swaps = [] if script or reached_by & self.imported else self.swaps(file, text)
         names = [name for name in self.rows if not swaps or reached_by & self.lines[name]]
         seconds = sum(self.rows[name][0] for name in names)

@@ -94,7 +94,7 @@ class EmergencyStop:
         except (ValueError, OverflowError, MemoryError):
             return
         self.changed = True
-        if order and self.latch.reset(order[0], order[1], 0, now):
+        if order and self.latch.reset(order[0], order[1], 0, now):  # boot, count, and no age: it was read just now
             self._unsaved = True
 
     # -- the state

@@ -114,7 +114,7 @@ def load(
     """
     path = Path(path).absolute()
     raw = decode(read_text(path), path.name)
-    if isinstance(raw, Pairs) and (keys := dict(raw).keys()) & {"robots", "tags"} and "robot" not in keys:
+    if isinstance(raw, Pairs) and "robot" not in (keys := dict(raw)) and ("robots" in keys or "tags" in keys):
         raise ConfigError(f"{path.name}: this is a world file, for pebble sim world; name the config file of a robot")
     return _config(raw, path, path.parent, env, lenient=lenient, core_only=core_only)
 

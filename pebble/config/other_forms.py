@@ -41,9 +41,9 @@ def reading_of(annotation: Any, kind: Any, metas: list[Meta], raw: Any, default:
             return Reading(value, differs=False)  # its meaning is the same
     if "unlike" in extra:
         return Reading(extra["unlike"])
-    if raw and isinstance(raw, str) and kind not in (int, float):
+    if raw and isinstance(raw, str) and kind not in (int, float):  # a text that is no form of a value is a mistake
         return None
-    is_empty = not raw or (raw is True and kind not in (int, float))
+    is_empty = not raw or (raw is True and kind not in (int, float))  # as a number a mere true is a mistake
     means_default = number == 0 or (is_empty and "exact" not in extra)
     if means_default and default is not NODEFAULT:
         return Reading(default)

@@ -117,7 +117,7 @@ class Forwarder:
             (side, SideState(side, transport, self.counters, clock, wins=side is winner))
             for side, transport in transports.items()
         )
-        #: Results of :func:`route`. There are few subjects, so no bound is needed.
+        #: Results of :func:`route` by its arguments, see _route. There are few subjects, so no bound is needed.
         self._routes: dict[tuple[Side, Subject, QoS, bool, bool | None, bool], Forward | Drop] = {}
         self._admission = Admission(clock)
         self.ages = CommandAges()
@@ -144,7 +144,7 @@ class Forwarder:
         for drop, side in itertools.product(_BOUNDS, Side):
             counts[drop.name.lower()] += self.counters[f"{side.value}: {drop.value}"]
         counts["events"] = self.counters["events_dropped"]
-        if shed := self.counters["shed"]:
+        if shed := self.counters["shed"]:  # counted by an extension, on thin links
             counts["shed"] = shed
         return dict(counts)
 
@@ -209,7 +209,7 @@ class Forwarder:
     def _receive_named(self, source: SideState, names: Names, message: Message) -> Routed:
         """Forward a message whose sender is checked: the name moves from the topic into the payload."""
         sender = names[message.topic]
-        subject, by = sender.subject, sender.account  # Signed, below, adds the person for whom the account acts
+        subject, by = sender.subject, sender.account  # by: a Signed, below, adds the person for whom the account acts
         outcome = self.admit(source, subject, message, sender.topic, by != NO_ACCOUNT)
         if subject is None:
             outcome = sender.foreign  # why the topic means nothing to this robot

@@ -70,11 +70,11 @@ class Launcher:
         """
         config = self._config
         if config.path is not None:
-            # root must not run the commands that another user writes into a config
+            # root must not run the commands that another user writes into a config; there=True: it has to exist
             require_own(config.path, does="runs nothing of it", there=True)
         own_records = OwnRecords(self._logs, config.log_level)
-        in_state_dir = config.state_file("launcher").with_suffix(".lock")
-        with own_records, RunLock(config.run_dir(), config.base, in_state_dir) as lock:
+        lock_in_state_dir = config.state_file("launcher").with_suffix(".lock")
+        with own_records, RunLock(config.run_dir(), config.base, lock_in_state_dir) as lock:
             self._signals.install()
             try:
                 self._reactor.every(_RUN_DIR_S, lambda: self._keep(lock))

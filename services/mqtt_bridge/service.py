@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 _PROBE_WAIT_S = 0.1
 _AGAIN_WAIT_S = 1.0  # once a probe has come back: its way may be slow
 _RETRY_S = 1.0
-_IGNORED = (Drop.ECHO, Drop.LATE, Drop.PROBE)  # nothing that a person or a program requests of the bridge now
+_IGNORED = (Drop.ECHO, Drop.LATE, Drop.PROBE)  # dropped messages that are no request, or are too late to be one
 LEFTOVERS_AFTER_S = 30.0  # by then all services have published what they retain; so long after the start, or later
 _LOGGED = 200  # characters of a topic
 _CHECK_STOPS_S = 1.0
@@ -416,7 +416,7 @@ class MqttBridge(ForwardingService):
             self.refusals.stale("a command" if channel is None else channel.metric)
             return
         if isinstance(routed.outcome, Drop) and (routed.outcome in _IGNORED or not is_local):
-            return  # of what is not forwarded, only requests of the robot's programs count
+            return  # a dropped message may be a request only if it is a program's of the robot, and not one of these
         if channel is None or codec.is_blank(message.payload):
             return
         if not message.retain and routed.outcome is not Drop.KNOWN:  # observers see what is new

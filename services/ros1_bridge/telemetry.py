@@ -47,8 +47,8 @@ class Telemetry:
         self._metrics, self._names, self._publish = section.telemetry, section.ros, publish
         self._counters, self._on_odometry = counters, on_odometry
         self._log = RateLimitedLog(log)
-        self._due: dict[Channel, float] = {}
-        self._goal: dict[str, Any] | None = None
+        self._due: dict[Channel, float] = {}  # when a channel may be published again
+        self._goal: dict[str, Any] | None = None  # the newest one, which the status repeats
         self._navigates_at = float("-inf")  # when a planner was last seen to pursue a goal
         metrics, names = self._metrics, self._names
         battery = metrics.charging_level.enabled or metrics.charging_status.enabled

@@ -105,7 +105,7 @@ class Dialler:
         return self._settings.as_published and self._settings.protocol == "3.1.1"
 
     def _probe(self, owner: Owner, counters: Counters, stopping: threading.Event) -> None:
-        """Connect and disconnect, without bridge mode, and without our will, which a failure would publish."""
+        """Test whether the broker accepts us without bridge mode and our will, which a failure would publish."""
         probe = self._make(None, owner, counters, as_published=False)
         try:
             probe.connect(stopping)
@@ -188,12 +188,12 @@ class Dialler:
         ``held_s``: how long a connection lasted, or 0. Return the problem in words ("": none yet), and True to log it.
         """
         addresses, asks_again = self.addresses, self.limits.asks_again
-        if self._is_last_attempt and not asks_again:
+        if self._is_last_attempt and not asks_again:  # this broker will not be asked once more
             why = problem.removeprefix(f"{addresses.where} ")  # the list of failures names the addresses
             failures = addresses.failed(why, held_s)
             if addresses.several:
                 problem = f"broker {addresses.host_port}: {failures}"
-        if asks_again and held_s <= 0:
+        if asks_again and held_s <= 0:  # the next attempt shows what the problem is
             return "", False
         # Of a round through several addresses, only the end is worth a line.
         return problem, held_s > 0 or addresses.is_over or not addresses.several

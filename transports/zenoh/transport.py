@@ -93,7 +93,7 @@ class ZenohTransport(Transport):
         except (zenoh.ZError, TransportError) as error:
             presence.release()
             raise TransportError(f"zenoh session of {self.client_id}: {error}") from None
-        if self._begin(session, presence.name):
+        if self._begin(session, presence.name):  # False: closed meanwhile
             presence.ready()
 
     def _start_client(self) -> bool:
@@ -223,7 +223,7 @@ class ZenohTransport(Transport):
             return False
         self._refresh()
         self._set_state(State.CONNECTED)
-        self._send_lacking(session, set())  # what became pending meanwhile
+        self._send_lacking(session, set())  # only what became pending meanwhile: the hub lacks nothing else
         return True
 
     def _send_hello(self, session: zenoh.Session) -> bool:

@@ -41,7 +41,12 @@ def view_of(tag: Tag, size: tuple[int, int]) -> View | None:
         return None
     x, y = tag.corners.mean(axis=0)
     near, between, far = _DISTANCES
-    distance = near if share >= _NEAR else between if share >= _MIDDLE else far
+    if share >= _NEAR:
+        distance = near
+    elif share >= _MIDDLE:
+        distance = between
+    else:
+        distance = far
     return _ROWS[int(3 * y / height)], _COLUMNS[int(3 * x / width)], distance
 
 

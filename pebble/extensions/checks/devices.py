@@ -60,6 +60,7 @@ def cameras(config: Config, folder: Path = Path("/dev")) -> Iterator[CheckResult
 
 
 def camera(backend: str, name: str, folder: Path) -> CheckResult:
+    """Check the camera that the config calls ``name``. ``folder``: where device files are."""
     if backend == "synthetic":
         return ok("synthetic: needs no device")
     if backend != "v4l2":

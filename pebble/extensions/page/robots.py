@@ -137,10 +137,11 @@ class Robots:
     def take(
         self, interest: Interest, now: float, *, large: bool
     ) -> tuple[tuple[tuple[str, str, Any, float], ...], bool]:
-        """Return the values that this page still needs (None: removed), and whether a large one is among them.
+        """Return the values that this page still needs, and whether a large one is among them.
 
-        They count as sent from now on. The component that the page has open comes first. At most one large value is
-        taken, and only with ``large``. The others, and what does not fit into this message, wait for the next.
+        Each: component, metric, value (None: removed), age in milliseconds. They count as sent from now on. The
+        component that the page has open comes first. At most one large value is taken, and only with ``large``. The
+        others, and what does not fit into this message, wait for the next.
         """
         dirty, interest.dirty = interest.dirty, set()
         taken: list[tuple[str, str, Any, float]] = []
@@ -292,10 +293,10 @@ class Robots:
 
     def _has_room(self, component: Component, metric: str, channel: c.Channel, more_bytes: int) -> bool:
         """True if a value may be stored. States of motor owners always may, as stop and control depend on them."""
-        if component.lists(metric):  # it is such a state
+        if component.lists(metric):  # it is the state of a motor owner
             return True
-        is_new = metric not in component.values  # of channels that are no patterns there are few
-        if is_new and len(component.values) >= MAX_METRICS and channel.is_pattern:
+        is_new = metric not in component.values
+        if is_new and len(component.values) >= MAX_METRICS and channel.is_pattern:  # the other channels are few
             return False
         return self._bytes + more_bytes <= MAX_BYTES or self.is_kept(component.ref)
 

@@ -143,7 +143,7 @@ class SilentBoards:
 
         def take(message: Message, now: float) -> None:
             if (robot := self._robots.view(ref)) is not None:
-                robot.receive(DRIVE, message, now, 0.0)
+                robot.receive(DRIVE, message, now, 0.0)  # the wall time is for heartbeats only
 
         try:
             board.subscription = await self._broker.subscribe(DRIVE.topic(ref), take)

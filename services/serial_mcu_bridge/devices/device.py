@@ -102,6 +102,10 @@ class Device:
         return Route(interface, generic, self._alias(interface, payload))
 
     def _alias(self, interface: Interface, payload: Any) -> Alias | None:
+        """Return the alias of an interface; None if its claim was not granted, or is another interface's.
+
+        ``payload``: the type of the payloads on its generic channel.
+        """
         claim = f"{c.INCOMING if interface.direction is Direction.IN else c.OUTGOING}/{interface.channel}"
         if self.claims.granted.get(claim) != interface.name:
             return None

@@ -66,7 +66,10 @@ class LocalOnly(PrivateTopics):
             self._listed.add(uid)
 
     def _judge(self, message: Message) -> list[Message]:
-        """Return ``message`` if it may pass. A retained value of an MCU without a list is kept until there is one."""
+        """Return ``message`` if it may pass. A retained value of an MCU without a list is kept until its list comes.
+
+        An empty message holds no value, so it needs no list.
+        """
         if self.stays(message.topic):
             return []
         uid = self._uid_of(message)

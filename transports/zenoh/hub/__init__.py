@@ -132,7 +132,7 @@ class ZenohHub:
 
     def _listen(self, worker: HubWorker) -> None:
         self._session = None
-        siblings = PeerRegistry(self._settings.run_dir).sockets()  # they would connect within 0.5 s; we connect at once
+        siblings = PeerRegistry(self._settings.run_dir).sockets()  # we connect at once; they take up to 0.5 s
         try:
             settings = replace(self._settings, listen=tuple(filter(self._is_free, self._settings.listen)))
             rules = self._admission.rules()
@@ -140,7 +140,7 @@ class ZenohHub:
             self._session = open_session(config)
         except zenoh.ZError as error:
             raise TransportError(f"the hub cannot open {self._socket}: {error}") from None
-        Barrier(self._session, self.name, lambda: 0)  # answers the clients that wait for this hub
+        Barrier(self._session, self.name, lambda: 0)  # the session keeps it: it answers clients that wait for this hub
         worker.serve(self._session)
 
     def _is_free(self, endpoint: str) -> bool:
@@ -153,11 +153,11 @@ class ZenohHub:
         host, _, port = place.rpartition(":")
         try:
             family, *_, address = socket.getaddrinfo(host.strip("[]"), int(port), type=kind)[0]
-            with socket.socket(family, kind) as tried:
+            with socket.socket(family, kind) as tried:  # TCP: a port that only ended connections hold is free
                 tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, kind == socket.SOCK_STREAM)
                 tried.bind(address)
         except (ValueError, OSError) as error:
-            if not isinstance(error, OSError) or error.errno != errno.EADDRINUSE:
+            if not (isinstance(error, OSError) and error.errno == errno.EADDRINUSE):
                 return True  # Zenoh says what is wrong with it
             fact = f"transport.listen: {endpoint}: {why_not(error, int(port))}"
             if not self._settings.of_robot:

@@ -221,13 +221,15 @@ class Gateway:
         self._listens_since = self._clock() if state is State.CONNECTED else float("inf")
 
     def _on_robot(self, message: Message) -> None:
+        """Note a live heartbeat of a robot."""
         address, payload = parse_topic(message.topic), message.payload
         if not payload or address is None or address.identity.is_server:
             return
         base = address.identity.base
-        may_be_old = message.retain  # with ``as_published`` live heartbeats are marked so, too
-        if may_be_old and not (self._hub.as_published and self._differs(base, payload)):
-            return
+        if message.retain:
+            may_be_live = self._hub.as_published  # then live heartbeats are marked so, too
+            if not (may_be_live and self._differs(base, payload)):
+                return
         if base in self._heard or len(self._heard) < MAX_ROBOTS:
             self._heard[base] = self._clock()
         else:

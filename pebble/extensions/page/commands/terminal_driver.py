@@ -104,7 +104,7 @@ class TerminalDriver:
         clock.echo(clock.ping(now), 1000 * now, now)  # at once: no network is between keys and driver
         view = self._driven.shown(self._tab, now)
         may_request = self.robot.situation(now).published
-        if view.keeps:  # the robot itself decides who drives it: it must have published who does
+        if view.keeps:  # the robot itself decides who drives: nothing is requested before it has published who does
             may_request = self._driven.published is not None
         if self._willing and may_request and not view.by and not view.asking:
             self._take(now, over=False)

@@ -60,7 +60,7 @@ class Writing:
         self._intake = intake
         self._files = OpenFiles(self._folder, about, background.watch)
         self._finisher = Finisher(background, self._intake.note, self._note_finished)
-        self._blocked: _Blocked | None = None
+        self._blocked: _Blocked | None = None  # why nothing can be written now
         self._lacking: list[Item] = []  # what no file has taken; bounded: a second of messages
         self._noted_drops = 0  # messages that were dropped, as recorded last
         self._changed = False  # files were finished since the folder was listed

@@ -41,8 +41,8 @@ class Archive:
 
     def __init__(self, *places: Path) -> None:
         self._places = places
-        self._named: list[_Named] = []
-        self._listed_at = float("-inf")
+        self._named: list[_Named] = []  # the files in these places
+        self._listed_at = float("-inf")  # when they were last listed
         self._open: dict[Path, RecordingFile] = {}
         self._failed: dict[Path, str] = {}  # why a file cannot be opened
 

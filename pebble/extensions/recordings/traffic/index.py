@@ -188,7 +188,7 @@ class _Rows:
             self._heartbeats.add(channel.id)
         metadata = channel.metadata
         qos = {"1": 1, "2": 2}.get(metadata.get("qos", ""), 0)
-        flags = [metadata.get(name, "0") not in ("", "0") for name in ("retain", "retained")]
+        flags = [metadata.get(name, "0") not in ("", "0") for name in ("retain", "retained")]  # see COLUMNS
         self._connection.execute(
             "INSERT INTO channels VALUES (?, ?, ?, ?, ?, ?, ?)", [channel.id, robot, direction, metric, qos, *flags]
         )

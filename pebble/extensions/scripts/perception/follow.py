@@ -101,7 +101,7 @@ class Follower:
     def __init__(self, settings: FollowSettings) -> None:
         self.settings = settings
         self._pulses = Pulses()
-        self._seen_at = self._side_since = float("-inf")
+        self._seen_at = self._side_since = float("-inf")  # when the tag was last seen; since when ``_side`` is so
         self._side = 1.0  # the side on which the tag was seen last, and to which the search turns: right is positive
         self._last = Command()
         self._holding = False  # the wanted distance is reached

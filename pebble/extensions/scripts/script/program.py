@@ -110,7 +110,10 @@ def _describe(
     *,
     drives: bool,
 ) -> None:
-    """Print the form that operators see. ``first``: the options that they see first."""
+    """Print the form that operators see.
+
+    ``words``: the script's label and summary. ``first``: the options that they see first, main_options of :func:`run`.
+    """
     settings = [] if options is None else form(options)
     keys = [setting.key for setting in settings]
     unknown = [key for key in first if key not in keys]
