@@ -25,7 +25,7 @@ def reading_of(annotation: Any, kind: Any, metas: list[Meta], raw: Any, default:
     """Return the value to use in place of ``raw``, which is not valid for this key; None if there is none to use.
 
     ``kind`` and ``metas`` are the parts of ``annotation``; ``default`` is that of the key, perhaps NODEFAULT. An empty
-    value, 0 or a mere true means the default, and numbers are brought within their limits; a text for zero is a
+    value, 0 or a mere true means the default, and numbers are brought within their limits; a 0 in quotes is a
     mistake where no number is wanted. Entries in the ``extra`` of ``metas`` change that: ``exact`` (only 0 means the
     default, and no number is changed), ``synonyms`` (other names of values), ``circle`` (the number at which a count
     starts again at 0), ``unlike`` (the value for any other ``raw``).

@@ -25,7 +25,7 @@ class Gate(Enum):
 
 
 class SideState:
-    """A side: its transport, messages that wait for it or may come back, and its window of retained messages.
+    """A side: its transport, events that wait for it, messages that it may send back, and its window of retained ones.
 
     ``wins``: the retained messages of this side count where the two sides differ.
     """

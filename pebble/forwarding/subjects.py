@@ -94,7 +94,7 @@ class Subjects(dict[str, Subject | None]):
     """Subjects by effective topic, those of all serial instances included.
 
     The subject is None for a topic that is invalid or not this robot's. A topic that was looked up before is found
-    without calling a Python function. ``config``: the robot's; its base is enough if no topic is renamed.
+    without calling a Python function. ``config``: the robot's, or only its base if no topic is renamed.
     """
 
     def __init__(self, config: Config | str) -> None:

@@ -81,7 +81,7 @@ class StateFile:
             return Unreadable()
 
     def appeared(self) -> Any:
-        """Return what :meth:`load` reads, on a disk mounted late for example; None if this process wrote the file."""
+        """Return what :meth:`load` reads if the file there is not this process's own (a disk came late); else None."""
         try:
             return None if self._own is not None and not self._own.replaced else self.load()
         except OSError:

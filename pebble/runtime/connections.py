@@ -89,7 +89,7 @@ def stops_transport(config: Config) -> Transport | None:
     """Return the bridge's second connection to operators, only for stops; None if there is none.
 
     At the level ``open`` there is one only if the link may be thin: on such a link a client that sends too much fills
-    the first connection. The second connection is not ``as_published``.
+    the first connection. The second one is not opened ``as_published`` (see :class:`Message`).
     """
     bridge = config.services.mqtt_bridge
     if config.security.level == "open" and (bridge.remote is not None or bridge.link.profile == "wide"):

@@ -121,7 +121,7 @@ class Dialler:
 
     @property
     def _is_last_attempt(self) -> bool:
-        """True unless another attempt has to show whether the broker has bridge mode."""
+        """True if no further attempt at this broker is needed to learn whether it has bridge mode."""
         return not self._asks_for_bridge_mode or self._bridge_mode.next_attempt is Attempt.BRIDGE
 
     def _note_result(self, result: Result) -> None:

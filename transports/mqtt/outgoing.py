@@ -270,7 +270,7 @@ class InFlightTable:
 
     @property
     def round_trip_s(self) -> float:
-        """The shortest recent round trip. By a longer one, of a delayed answer, a stall would be noticed too late."""
+        """The shortest recent round trip: a longer one includes a delay, and would let a stall be noticed too late."""
         return min(self._round_trips, default=0.0)
 
     def newest_answer(self, now: float) -> tuple[int, float]:

@@ -115,7 +115,7 @@ class BrokerDelay:
         self._delivered_answer = self._read_answer
 
     def delivery(self, now: float) -> tuple[float, float]:
-        """Return the age of the newest ping whose answer came before the last delivery, and how late answers are."""
+        """Return the age of the newest ping answered before :meth:`delivered` was called, and how late answers are."""
         sent_at, took = self._delivered_answer
         waits = now - self._pings[0].sent_at if self._pings else 0.0
         return now - sent_at, max(took, waits) - self._shortest

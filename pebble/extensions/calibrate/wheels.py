@@ -142,7 +142,7 @@ class _Session:
     # -- the two kinds
 
     def _straight(self, number: str, sign: int) -> Run:
-        """Drive a straight; return the steps of the wheels with the true movement, by the tag or by the person."""
+        """Drive a straight; return the wheels' steps and the true movement, as the tag shows or the person types."""
         name = f"{number}, straight {'there' if sign > 0 else 'back'}"
         wanted, mm = self._wanted, sign * self._wanted.length_m * 1000
         if wanted.truth == "tag":

@@ -369,7 +369,7 @@ class Robots:
                 interest.notify()
 
     def _mark(self, ref: str, metric: str, *, everybody: bool = False) -> None:
-        """Note that pages need a value: all if ``everybody``, or if all show the metric; else those showing ``ref``."""
+        """Note that pages need a value: all if ``everybody`` or it is of FLEET; else those that show ``ref``."""
         channel = _channel(metric)
         everybody = everybody or channel in FLEET
         for interest in self.interests:

@@ -44,7 +44,7 @@ class LocalScripts:
     def hold(self) -> None:
         """Lock the file while a script runs. The script runs even if this fails.
 
-        Where the system refuses the lock, :meth:`none_runs` does not get it either, so neighbours drive nothing.
+        Where the system refuses the lock, :meth:`none_runs` does not get it either: no other robot may drive this one.
         """
         if self._held is None:
             try:
@@ -163,7 +163,7 @@ def _above(barred: int, *used: int) -> int:
     """Return the number after the newest of ``barred`` and ``used``; 0 stands for no number.
 
     The numbers form a circle: after the last one comes 1. From ``barred`` on, half of the circle counts as newer, the
-    other half as older. A used number is left out if the number after it is in the older half.
+    other half as older. A used number counts only if the number after it is in the newer half.
     """
     base = barred or newest(used)
     steps_ahead = [(run - base) & LAST_RUN for run in used if run and newer(following(run), base)]

@@ -179,7 +179,7 @@ class ThinUplink(Uplink):
         return seconds * _PAUSE if self._meter.level == "thin" else seconds
 
     def poll(self) -> bool:
-        """Measure the link, and send what has room now; return True if a heartbeat may be due, too."""
+        """Measure the link, and send what has room now; return True to have :meth:`heartbeat_due` asked, too."""
         now = self._clock()
         outgoing = self._remote.outgoing
         with self._guard:

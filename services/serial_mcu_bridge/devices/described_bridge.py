@@ -132,7 +132,7 @@ class DescribedBridge(SerialService):
         self._arm()
 
     def _arm(self) -> None:
-        """Set the timer if the next event is earlier; a timer that is too early does no harm."""
+        """Set the timer, unless it is set for the next event or earlier: a timer that is too early does no harm."""
         times = [due for due in (self._session.due, self._peers.due) if due is not None]
         due = min(times, default=None)
         if due is None or (self._timer is not None and self._timer.due <= due):

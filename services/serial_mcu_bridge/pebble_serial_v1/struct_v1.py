@@ -93,7 +93,7 @@ def _layout(types: tuple[FieldType, ...]) -> struct.Struct:
 
 
 def _value(field: Field, raw: Any) -> Any:
-    """Return a field's value for JSON: the packed number, scaled, with no digits that it does not have."""
+    """Return a field's value for JSON: the packed number, scaled and rounded, so that 3 × 0.1 is 0.3."""
     if field.type is FieldType.BOOL:
         return raw
     if field.type is FieldType.F32:

@@ -73,7 +73,7 @@ def _swings(readings: list[tuple[float, Any]]) -> Iterator[float]:
 
 
 def _wheel_reports(robot: Observer) -> list[tuple[float, list[float]]]:
-    """Return the wheel speeds, each with its time: those that ``robot.eyes`` saw; if it saw none, the reported ones."""
+    """Return the wheel speeds, each with its time: as seen from outside (``robot.eyes``), or else as reported."""
     reports = [(report.at, report.value.value.get("wheels")) for report in robot.of(c.STATUS) if report.value]
     return robot.eyes() or [(at, wheels) for at, wheels in reports if _are_speeds(wheels)]
 

@@ -94,7 +94,7 @@ class EndedEarlyError(Exception):
 class Operator:
     """The demo's driver, with a thread and a connection of its own.
 
-    ``activity`` and ``events`` (seconds and a line) are for display. ``visitors`` knows the robots that people have.
+    ``activity`` and ``events`` (seconds and a line) are for display. ``visitors`` notes the robots that people take.
     ``completed`` collects the commands that were driven. The emergency stop and the script belong to the first round.
     """
 

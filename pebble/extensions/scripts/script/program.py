@@ -207,7 +207,7 @@ def _connected(config: Config, path: Path) -> Transport:
 def _numbered(config: Config) -> Callable[[int], int]:
     """Return a function that gives this run its number. Raises ConfigError.
 
-    A manager that starts the script has chosen it; else it is a new one, above the function's argument.
+    If a manager started the script, the manager has chosen it; else it is a new one, above the function's argument.
     """
     text = os.environ.get(RUN)
     if text is None:

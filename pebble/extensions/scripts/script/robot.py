@@ -215,7 +215,7 @@ class Robot:
     # -- its end
 
     def end(self, why: str, exit_code: int = 0) -> None:
-        """Publish the final stop and close the cameras; every later call raises Stopped. From any thread."""
+        """Publish the final zero and close the cameras; every later call raises Stopped. From any thread."""
         if os.getpid() != self._pid:  # a forked copy of the script's process
             return
         if not self._stopped.is_set():  # the first end decides
