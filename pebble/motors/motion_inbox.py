@@ -59,9 +59,9 @@ class Batch(Struct):
 class MotionInbox:
     """A bounded inbox. Any thread may put, one takes. ``put`` returns True if the inbox was empty: then wake the taker.
 
-    Of each sender the newest drive command waits, and before it a zero that it replaced, which may end a script or the
-    wait after a reset. The holder of control is a sender apart, so that no other replaces its commands. So is each
-    client that requests control, by account and id as in the lease: one account may be used by any number of persons.
+    Of each sender the newest drive command waits. A zero before it waits, too: that may end a script, or the wait after
+    a reset. The holder of control is a sender apart, so that no other replaces its commands. So is each client that
+    requests control, by account and id as in the lease: one account may be used by any number of persons.
     """
 
     def __init__(self, control: Control) -> None:
