@@ -113,8 +113,8 @@ def _subscribe(robots: Sequence["CarriedRobot"], side: Side, transport: Transpor
 class CarriedRobot:
     """A robot of the hub for which the gateway forwards.
 
-    ``stops_pass()``: True if another connection carries stops; called for each stop. ``too_large``: called with the
-    topic of a message that is too large for any broker.
+    ``stops_pass()``: True if stops pass by another connection, so that this forwarder leaves them out; called for each
+    stop. ``too_large``: called with the topic of a message that is too large for any broker.
     """
 
     def __init__(
