@@ -86,7 +86,7 @@ class Stage(IntEnum):
 class Program(Struct, frozen=True):
     """A process: its name in logs and status, and what it runs with ``arguments``.
 
-    That is a service (``module:Class``), or a module, as ``python -m`` does. The launcher imports the module before
+    It runs a service (``module:Class``), or a module as ``python -m`` runs it. The launcher imports the module before
     it forks: importing must do nothing. Import what only some robots need in the functions that use it: then it is in
     the memory of those robots only.
     """

@@ -113,7 +113,7 @@ class FileLock:
         return _is_at(self.path, self._descriptor)
 
     def write(self, text: bytes) -> None:
-        """Replace the text in the file. If the disk is full, zeros remain: the lock counts, the text is for people."""
+        """Replace the text in the file. If the disk is full, zeros remain, which count as a text that says nothing."""
         try:
             os.truncate(self._descriptor, len(text))  # needs no space
             os.pwrite(self._descriptor, text, 0)

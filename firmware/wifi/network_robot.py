@@ -86,7 +86,7 @@ class NetworkRobot:
         self.body.stop()
 
     def _guard(self, now: int) -> None:
-        """Stop the motors if control has passed on or their time is over; let the body repeat what was not received."""
+        """Stop the motors if control has passed on or no command came in time; let the body send again what failed."""
         stops = self.stops
         stops.tick(now)
         if stops.lease.halts:  # each new driver begins with wheels at rest

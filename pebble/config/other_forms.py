@@ -10,7 +10,7 @@ _SWITCHES = {"1": True, "true": True, "yes": True, "on": True, "0": False, "fals
 
 
 class Reading(NamedTuple):
-    """A value to use in place of an unexpected one; ``differs``: its meaning is another, and not only its form."""
+    """A value to use in place of an unexpected one; ``differs``: the two differ in meaning, and not only in form."""
 
     value: Any
     differs: bool = True

@@ -116,7 +116,7 @@ class Launcher:
         )
 
     def _driveable_by(self, running: Collection[str]) -> Driveable:
-        """Return the judge of the motors of the programs ``running``; it knows serial lines without motors, too."""
+        """Return the `Driveable` of the programs ``running``: of their motors, and of serial lines without motors."""
         lines = {program_of(name): self._config.motor_owner(name) for name in self._config.serial_instances()}
         by_extensions = {program: name for name, program in motors_of(self._config.installed, self._config).items()}
         owners = [*map(program_of, self._config.motor_lines()), *by_extensions]

@@ -163,7 +163,7 @@ class MotorGuard:
             self._state.changed(now)
 
     def save_again(self) -> None:
-        """Write the file once it can be written at all; write it again if the last write failed, or it was removed.
+        """Write the file as soon as that is possible; write it again if the last write failed, or the file was removed.
 
         It is not written again while a write is still running, or in a folder that is lost, where every write fails.
         """

@@ -340,7 +340,7 @@ class MotorOwner(Service, ABC):
         self._arm_guard()
 
     def _publish_state(self, state: p.EstopState) -> None:
-        """Publish ``state``; while stops do not latch, clear its topic at each call: a bridge may miss a clearing."""
+        """Publish ``state`` or, if stops do not latch, clear its topic at each call, because a bridge may miss one."""
         if self._latches:
             self.publish(c.ESTOP_STATE, state, owner=self.owner)
         else:

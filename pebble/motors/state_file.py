@@ -52,7 +52,7 @@ class StateFile:
             return True
 
     def can_save(self) -> bool:
-        """True if a write may be tried: its folder can be written or made, or is :attr:`lost`, as a write reports."""
+        """True if a write may be tried: its folder can be written or made, or is :attr:`lost`: a write reports that."""
         existing = next(folder for folder in self.path.parents if os.access(folder, os.F_OK))
         return self.lost or (existing.is_dir() and os.access(existing, os.W_OK | os.X_OK))
 

@@ -60,7 +60,7 @@ def check_connections(config: Config) -> None:
 
 
 def local_settings(config: Config, as_published: bool = False) -> Any:
-    """Return the settings of the local transport; for a third party's transport they are ``transport.settings``."""
+    """Return the local transport's settings, a third party's as in the config. ``as_published``: see `MqttSettings`."""
     kind = config.transport.kind
     if kind == "mqtt":
         settings = mqtt_settings(config.local_mqtt, as_published=as_published, reconnect_max_s=LOCAL_RECONNECT_S)

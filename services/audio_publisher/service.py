@@ -121,7 +121,7 @@ class AudioPublisher(Service):
     def _encoder_for(self, rate: int, channels: int) -> SoundEncoder:
         """Return the encoder, or another one if its settings must change.
 
-        A change of the step waits for the end of a packet.
+        If only the rate control's :class:`Step` changes, that waits for the end of a packet.
         """
         step = self._rate.step if self._requested == "opus" else self._rate.configured
         needed = (self._requested, rate, channels)

@@ -80,8 +80,8 @@ class MotorOwners:
     def ending(self, run: int, baseline: Baseline, signs: bool = True) -> str:
         """Return why this run must end; empty if it may continue. New owners are added to ``baseline``.
 
-        ``signs`` False: its script does not sign its commands. Owners take them for a person's and so bar the run at
-        once, which says nothing about people.
+        ``signs`` False: its script does not sign its commands. Owners take them for a person's, and bar the run at
+        once: here a barred run is no reason to end.
         """
         for owner, state in self._states.items():
             boot, count, barred = baseline.setdefault(owner, (state.boot, state.count, 0))

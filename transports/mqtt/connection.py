@@ -281,7 +281,7 @@ class Connection:
         return _OVERHEAD + len(message.topic.encode()) + len(message.payload) <= self.max_packet
 
     def _is_full(self, message: Message) -> bool:
-        """True if ``message`` is refused beyond UNACKED_LIMIT: all are, except UNACKED_RESERVE more emergency stops."""
+        """True if ``message`` is refused at UNACKED_LIMIT, as all are but the next UNACKED_RESERVE emergency stops."""
         beyond = self.in_flight.unacked - UNACKED_LIMIT
         return beyond >= UNACKED_RESERVE or not self._owner.policy.is_stop(message.topic)
 

@@ -105,7 +105,7 @@ class Dialler:
         return self._settings.as_published and self._settings.protocol == "3.1.1"
 
     def _probe(self, owner: Owner, counters: Counters, stopping: threading.Event) -> None:
-        """Test whether the broker accepts us without bridge mode and our will, which a failure would publish."""
+        """Test whether the broker accepts us without bridge mode; leave our will out, as a failure would publish it."""
         probe = self._make(None, owner, counters, as_published=False)
         try:
             probe.connect(stopping)

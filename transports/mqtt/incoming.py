@@ -1,4 +1,4 @@
-"""Reads packets from a broker on one MQTT connection, in batches, and makes messages with an age of them."""
+"""Reads packets from a broker on one MQTT connection, in batches, and makes a message of each PUBLISH, with its age."""
 
 import logging
 from collections.abc import Mapping

@@ -100,12 +100,12 @@ def following(run: int) -> int:
 def next_run(config: Config, barred: int = 0, received: int = 0) -> int:
     """Return the number of a run that starts now: newer than ``barred``, which motor owners report.
 
-    It is also above every earlier run of this robot, and above ``received``, the newest run whose commands have come.
-    Of these, a number far ahead of ``barred``, as a stranger may send it, counts as older and is left out: the numbers
-    go round.
+    It is also newer than the last run of this robot, which a file holds, and than ``received``, the newest run whose
+    commands have come. Either is left out if it is far ahead of ``barred``, as a number from a stranger may be: the
+    numbers go round, so it counts as older.
 
-    Several processes may call this at once. If the file is missing or damaged, it counts from the clock. Raises
-    PebbleError if another process does not release the file.
+    Several processes may call this at once. If the file is missing or damaged, the number is made from the clock.
+    Raises PebbleError if another process does not release the file.
     """
     return _next(config.state_file("autonomy-run"), barred, time.time, received)
 

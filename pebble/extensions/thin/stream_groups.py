@@ -64,7 +64,7 @@ class StreamGroups:
         self._is_announced = False
 
     def heard(self, raw: bytes) -> None:
-        """Note an expander's announcement. If it does not name our short topic, let the expander hear a group there."""
+        """Note an expander's announcement. If it lacks our short topic, send an empty group there to be heard."""
         now = self._clock()
         if now - self._heard_at > HEARD_S:
             self._heard_since, self._tries = now, 0

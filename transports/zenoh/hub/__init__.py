@@ -144,9 +144,9 @@ class ZenohHub:
         worker.serve(self._session)
 
     def _is_free(self, endpoint: str) -> bool:
-        """True unless another process uses the endpoint. That is logged, or raised as TransportError.
+        """True unless another process uses the endpoint; then a hub that is no robot's raises TransportError.
 
-        A robot's hub runs without such an endpoint, because any user can take a port; other hubs end.
+        A robot's hub logs it and runs without the endpoint, because any user can take a port.
         """
         kind = socket.SOCK_DGRAM if endpoint.startswith("quic/") else socket.SOCK_STREAM
         place = endpoint.partition("/")[2].partition("#")[0].partition("?")[0]  # without protocol and options

@@ -36,7 +36,7 @@ class Printer:
         self._config, self._as_json = shlex.quote(config), as_json
 
     def take(self, result: CheckResult, why: str = "") -> None:
-        """Print a result; of a bad one also ``why``, what goes wrong for people then.
+        """Print a result; after a bad one also ``why``: what goes wrong for people because of it.
 
         Texts may come from the robot, so secrets and control characters are masked.
         """

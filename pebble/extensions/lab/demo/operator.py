@@ -1,4 +1,4 @@
-"""A scripted operator of a broker's robots: it drives steps, an emergency stop, and a script that it overrules.
+"""A scripted operator of a broker's robots: it drives them in steps, stops them all, and overrules a script.
 
 It yields to people: a robot that another person drives, or has stopped, is left alone until the next step. Times are
 seconds of time.monotonic().
@@ -315,7 +315,7 @@ class Operator:
         self._complete(AFTER_RESET, _FORWARD, reset_at, released, time.monotonic())
 
     def _show_trails(self, robots: Sequence[RobotView]) -> None:
-        """Start the script that publishes a robot's position on each robot that has it, unless it runs another script.
+        """Start the script that publishes the position, on each robot that has this script and runs none.
 
         A robot that is stopped, or was driven a moment ago, refuses to start a script.
         """

@@ -185,7 +185,7 @@ class RobotView:
     def _note_retained_drive(self, message: Message) -> None:
         """Note whether a drive command that moves the robot is retained.
 
-        A message that is empty and not retained itself removes it.
+        An empty message, which brokers deliver without the retain flag, tells that the retained one was removed.
         """
         if message.retain or not message.payload:
             self.parked = bool(message.payload)
@@ -193,9 +193,9 @@ class RobotView:
                 self.parked = self.parked and codec.decode(c.DRIVE, message.payload).moves
 
     def _keep_for_late_stop(self, message: Message) -> None:
-        """Keep the topic's newest message: an emergency stop that begins later starts with all kept messages.
+        """Keep the topic's newest message: an emergency stop that this program sends later gets all kept ones first.
 
-        Capabilities have a place even after MAX_REMEMBERED states of owners.
+        Capabilities are kept even if there are MAX_REMEMBERED states of owners already.
         """
         has_place = message.topic in self.remembered or message.topic == c.CAPABILITIES.topic(self.base)
         if not message.payload:

@@ -163,9 +163,9 @@ def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
 
 @contextmanager
 def _heartbeats(target: Target, *, every: bool) -> Iterator[Heartbeats | None]:
-    """Open a connection for the heartbeats of all robots, for a stop of all at a broker; otherwise yield None.
+    """Yield a connection for heartbeats if all robots of a broker are to be stopped (``every``), else None.
 
-    With a client id from the config there can be only one connection.
+    It is None, too, with a client id from the config, with which there can be only one connection.
     """
     _, settings, _, _ = resolve(target)
     if not every or not isinstance(settings, MqttSettings) or settings.client_id is not None:

@@ -321,7 +321,7 @@ class DrivenRobot:
         return commands
 
     def _give(self, tab: Tab, client: ControlClient | None, now: float) -> list[Command]:
-        """Give a page control, by its request to the robot or (``client`` None) by this server; halt what moves."""
+        """Give a page control; halt what moves. ``client`` has got control of the robot; None: this server gives it."""
         commands = self._on(Event.GIVEN, now) + tab.interrupt(tab.gesture, now)  # a key held down now moves no robot
         self.tab, self.client, self._given_key = tab, client, "" if client is None else client.decided
         self._idle_from = now

@@ -84,7 +84,7 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
             self._skip(now)
 
     def _extend_chain(self, payload: bytes, header: PictureHeader, *, fits: bool) -> None:
-        """Add a picture to the chain, or begin or end it. ``fits``: no picture before this one is missing."""
+        """Extend, begin or end the chain: a key frame and all pictures since. ``fits``: none is missing before this."""
         grown = self._chain_bytes + len(payload)
         if header.keyframe:
             self.key = KeyFrame(payload, time.monotonic())

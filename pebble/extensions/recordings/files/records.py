@@ -70,7 +70,7 @@ def unpack_chunk(data: bytes) -> bytes:
 
 
 def record_of(data: bytes) -> McapRecord:
-    """Return the parsed record. Raises DamageError, also if its lengths do not fit exactly, except for a chunk."""
+    """Return the parsed record. Raises DamageError, also for lengths that do not fit exactly (unchecked in a chunk)."""
     from mcap.data_stream import RecordBuilder
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader

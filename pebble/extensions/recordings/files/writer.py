@@ -123,7 +123,7 @@ class _Output(BufferedIOBase):
 
 
 def _packed(channels: list[Channel]) -> bytes:
-    """Return the declarations of the channels without a schema, to repeat them where damage does not reach them.
+    """Return the declarations of those channels that have no schema, to repeat them where damage does not reach them.
 
     For other channels the schema would have to be repeated as well.
     """

@@ -128,8 +128,8 @@ class PhaseTracker:
     def _predict(self, power: float) -> float:
         """Return the phase that this sample should add: by the power, and by the measured speed if that agrees.
 
-        If the expected direction changes, the phase may go back from now on: its limit, the farthest phase reached,
-        is set to the present one.
+        If the expected direction changes, the phase may go back from now on: the farthest phase reached, behind which
+        it must not go, is set to the present one.
         """
         before = self._expected
         mean_power = (self._power + power) / 2  # a command comes between two samples

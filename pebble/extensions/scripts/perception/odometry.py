@@ -69,7 +69,7 @@ class OdometrySettings(Struct, frozen=True, kw_only=True):
 
 
 def calibrated(settings: OdometrySettings, calibration: Calibration) -> OdometrySettings:
-    """Return the settings with measured values in place of those that have their defaults."""
+    """Return the settings with the measured values, but keep each value that the user has changed from its default."""
     default = OdometrySettings()
     if settings.step_mm == default.step_mm:
         steps = {"left_mm_per_event": calibration.left_step_mm, "right_mm_per_event": calibration.right_step_mm}

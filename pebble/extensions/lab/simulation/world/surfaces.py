@@ -105,7 +105,7 @@ def _bgr(colour: str) -> Colour:
 
 
 def _drawn(drawing: Drawing) -> Surface:
-    """Return the surface of a drawing. Its masks hide what is between the shapes."""
+    """Return the surface of a drawing, whose masks make all but the shapes transparent."""
     import cv2
 
     # masked parts have a colour, too: in smaller textures it mixes into the edges of the shapes
