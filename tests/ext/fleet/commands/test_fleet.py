@@ -16,8 +16,9 @@ from typing import Any
 
 import pytest
 
-from pebble.config import ConfigError, load
+from pebble.config import load
 from pebble.config.raw import deep_merge
+from pebble.errors import ConfigError
 from pebble.extensions.fleet import authority, certificates
 from pebble.extensions.fleet.folder import FLEET, ZENOH
 from pebble.extensions.fleet.gateway.gateway_file import load_gateway
