@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +29,7 @@ def handled_by(handler: Callable[[int, FrameType | None], Any], *more: int) -> I
 def interrupted_by_signals() -> Iterator[None]:
     """Raise KeyboardInterrupt on SIGTERM and SIGHUP too, so that a command cleans up as after Ctrl-C.
 
-    In the main thread only.
+    It ends with the exit code of Ctrl-C, having no result. In the main thread only.
     """
 
     def interrupt(_signal: int, _frame: FrameType | None) -> None:
@@ -37,6 +37,28 @@ def interrupted_by_signals() -> Iterator[None]:
 
     with handled_by(interrupt):
         yield
+
+
+class _EndedError(KeyboardInterrupt):
+    """An end by SIGTERM of a block of :func:`until_ended`."""
+
+
+@contextmanager
+def until_ended() -> Iterator[None]:
+    """Leave the block, whose exits close what is open, on SIGTERM: for commands that run until they are ended.
+
+    In the main thread only.
+    """
+
+    def end(_signal: int, _frame: FrameType | None) -> None:
+        raise _EndedError
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        with suppress(_EndedError):
+            yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager
