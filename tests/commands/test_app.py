@@ -66,6 +66,7 @@ def test_a_command_imports_no_other() -> None:
         (("topic", "list", "--url", "mqtt://127.0.0.1", "--remote"), "--remote", ""),
         (("topic", "echo", "online", "--url", "mqtt://127.0.0.1", "--robot", "a/b"), "--robot a/b", ""),
         (("topic", "list", "--url", "mqtt://127.0.0.1:1"), "127.0.0.1:1", ""),
+        (("topic", "list", "--url", "zenoh:/nowhere"), "`pebble up CONFIG` starts it", ""),
     ],
 )
 def test_what_is_wrong_is_one_line_and_exit_code_1_or_for_a_command_line_2(
