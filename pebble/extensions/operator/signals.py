@@ -29,7 +29,7 @@ def handled_by(handler: Callable[[int, FrameType | None], Any], *more: int) -> I
 def interrupted_by_signals() -> Iterator[None]:
     """Raise KeyboardInterrupt on SIGTERM and SIGHUP too, so that a command cleans up as after Ctrl-C.
 
-    It ends with the exit code of Ctrl-C, having no result. In the main thread only.
+    In the main thread only.
     """
 
     def interrupt(_signal: int, _frame: FrameType | None) -> None:
@@ -43,17 +43,14 @@ class _EndedError(KeyboardInterrupt):
     """An end by SIGTERM of a block of :func:`until_ended`."""
 
 
+def _end(_signal: int, _frame: FrameType | None) -> None:
+    raise _EndedError
+
+
 @contextmanager
 def until_ended() -> Iterator[None]:
-    """Leave the block, whose exits close what is open, on SIGTERM: for commands that run until they are ended.
-
-    In the main thread only.
-    """
-
-    def end(_signal: int, _frame: FrameType | None) -> None:
-        raise _EndedError
-
-    before = signal.signal(signal.SIGTERM, end)
+    """Leave the block on SIGTERM, as commands do that run until they are ended. In the main thread only."""
+    before = signal.signal(signal.SIGTERM, _end)
     try:
         with suppress(_EndedError):
             yield

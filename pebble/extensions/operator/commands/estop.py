@@ -334,9 +334,10 @@ def _reset(target: Target) -> int:
 
         put_account_into_topics(transport, names, is_named)
         robot.subscribe(receiving)
-        for channel in (LINK, STATUS):  # for ``view.pace`` and ``view.driveable``; the times of arrival do not matter
+        # for ``view.pace`` and ``view.driveable``, the longer one where it delays no answer; times do not matter
+        for channel, connection in ((LINK, receiving), (STATUS, transport)):
             take = partial(view.receive, channel, now=0.0, wall=0.0)
-            receiving.subscribe(channel.topic(robot.base), take, direct=True)
+            connection.subscribe(channel.topic(robot.base), take, direct=True)
         wait_for(lambda: robot.has_capabilities, _ANSWER_S)
         receiving.ask(robot.missing)  # stop states: the capabilities that list the owners may just have come
         wait_for(lambda: not robot.missing, _ANSWER_S)

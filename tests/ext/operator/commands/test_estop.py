@@ -235,6 +235,8 @@ KEPT = {
     "capabilities of a stranger, on a page": ("pebble/robots/attic", "capabilities", ("page", "")),
     "capabilities of a stranger, in its status": ("pebble/robots/attic", "capabilities", ("estop", "status", "{id}")),
     "capabilities of a stranger, at its reset": ("pebble/robots/attic", "capabilities", ("estop", "reset", "{id}")),
+    "its own status": ("", "status", ("estop", "{id}")),
+    "its own status, at its reset": ("", "status", ("estop", "reset", "{id}")),
 }
 
 
