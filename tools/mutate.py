@@ -67,10 +67,10 @@ def mutants(file: str, text: bytes) -> Iterator[Mutant]:
     starts = [0, *itertools.accumulate(map(len, text.splitlines(keepends=True)))]
     numbers: Counter[str] = Counter()
 
-    def walk(node: Any, function: str, statement: int) -> Iterator[Mutant]:
+    def walk(node: Any, function: str, statement_line: int) -> Iterator[Mutant]:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
             function = f"{function}.{node.name}".lstrip(".")
-        statement = node.lineno if isinstance(node, ast.stmt) else statement
+        statement_line = node.lineno if isinstance(node, ast.stmt) else statement_line
         is_log = False
         for operator, part, new in replacements(node):
             is_log = is_log or operator == "log"
@@ -79,16 +79,17 @@ def mutants(file: str, text: bytes) -> Iterator[Mutant]:
             start, end = starts[part.lineno - 1] + part.col_offset, starts[part.end_lineno - 1] + part.end_col_offset
             newlines = text.count(b"\n", start, end) * "\n"  # so that what follows stays on its lines
             replacement = ast.unparse(new) + newlines
-            replacement = replacement if isinstance(new, ast.Constant | ast.Pass) else f"({replacement})"
+            if not isinstance(new, ast.Constant | ast.Pass):  # so that it stays one operand
+                replacement = f"({replacement})"
             change = " ".join(f"{text[start:end].decode()} -> {ast.unparse(new)}".split())
             record = {"name": f"{name}:{numbers[name]}", "file": file, "line": part.lineno, "change": change}
-            reached_by = {(file, line) for line in (statement, *range(part.lineno, part.end_lineno + 1))}
+            reached_by = {(file, line) for line in (statement_line, *range(part.lineno, part.end_lineno + 1))}
             yield record, reached_by, text[:start] + replacement.encode() + text[end:]
         # Annotations and decorators are not mutated, nor what is inside a call that logs or an f-string.
         vars(node).update(annotation=None, returns=None, decorator_list=[])
         if not is_log and not isinstance(node, ast.JoinedStr):
             for child in ast.iter_child_nodes(node):
-                yield from walk(child, function, statement)
+                yield from walk(child, function, statement_line)
 
     return walk(ast.parse(text), "", 0)
 
@@ -196,9 +197,11 @@ class Trial:
     """A plugin for pytest that runs the collected rows without a mutant, and with each, in a copy of the tree."""
 
     def __init__(self, files: list[str], tests: list[str], work: Path, options: argparse.Namespace) -> None:
+        # The copy of the tree, and files in which child processes note the rows that failed, and those that passed.
         self.tree, self.failed, self.passed, self.options = work / "tree", work / "failed", work / "passed", options
         self.texts = {file: (ROOT / file).read_bytes() for file in files}
         self.file_of = functools.cache(lambda path: os.path.relpath(os.path.realpath(path), self.tree))
+        #: By file, qualified name and first line.
         self.functions: defaultdict[tuple[str, str, int], list[FunctionType]] = defaultdict(list)
         self.arcs: set[tuple[str, int, int]] = set()  # of a row: file, from which line, to which; 0: the function ends
         marks = "page or alone" if options.thorough else "page or alone or thorough"
@@ -249,6 +252,7 @@ class Trial:
         gc.freeze()
         for file, text in self.texts.items():
             possible = script_mutants(file, text) if file.endswith(".js") else mutants(file, text)
+            # A draw: by a hash of the name in each mutant's record, which the seed changes.
             drawn = sorted(possible, key=lambda mutant: crc32(mutant[0]["name"].encode(), self.options.seed))
             report(file, len(drawn), [self.attempt(*mutant) for mutant in drawn[: self.options.n or None]])
         return True
@@ -306,7 +310,7 @@ class Trial:
         """Run rows with a mutant; write the result, and return it."""
         start, file = time.monotonic(), record["file"]
         script = file.endswith(".js")
-        # Functions whose code a fork can exchange. None: all rows run with the changed file instead.
+        # Functions whose code a fork can exchange. If it is empty, all rows run with the changed file instead.
         swaps = [] if script or reached_by & self.imported else self.swaps(file, text)
         names = [name for name in self.rows if not swaps or reached_by & self.lines[name]]
         seconds = sum(self.rows[name][0] for name in names)

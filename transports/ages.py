@@ -77,7 +77,7 @@ class SenderClocks(Generic[K]):
         """Return the seconds that a message stamped ``sent`` has waited at ``now``; learn the sender's clock from it.
 
         A message that has waited for more than ``late_s`` is late. ``waited_s``: the most that it can have waited, by
-        other evidence; if not late, it proves a least difference. A clock under 2 s old returns at least ``waited_s``.
+        other evidence; unless late, it gives `_Clock.proved`. A clock under 2 s old returns at least ``waited_s``.
         """
         with self._lock:
             clock = self._clocks.get(key)
@@ -89,7 +89,7 @@ class SenderClocks(Generic[K]):
                 clock = self._clock_to_use(key, clock, sent, now, late_s)
             if waited_s <= late_s:
                 clock.proved = max(clock.proved, now - sent - waited_s)
-            # Without delay the difference is from `proved` to `least`. With the smaller, ages are rather too long.
+            # Without delay the difference lies from `proved` to `least`. By the smaller one an age is rather too long.
             age = now - sent - min(clock.least, clock.proved)
             return age if now - clock.began >= _YOUNG_S else max(age, waited_s)
 

@@ -100,8 +100,8 @@ class Subscription:
     def offer(self, message: Message, *, repeat: bool = False) -> None:
         """Queue ``message``, unless it is a retained message of a topic this connection has already delivered (T5, T8).
 
-        With ``policy.delivers_late`` such a message is queued, too. Where ``transport.as_published``, retained and live
-        messages look alike; there the backend sets ``repeat`` when it is sure that the message is a repetition.
+        With ``policy.delivers_late`` such a message is queued, too. If ``transport.as_published`` is True, retained and
+        live messages look alike: then the backend sets ``repeat`` when it is sure that the message is a repetition.
         """
         transport = self._transport
         with self._lock:

@@ -53,7 +53,7 @@ class Driver:
             return "the robot is silent"
         if self.robot.is_stopped() or is_stopping:
             return "the robot is stopped"
-        if self.is_moving and self.robot.gives_control() and not self.robot.key(self.id):
+        if self.is_moving and self.robot.gives_control() and not self.robot.key(self.id):  # it lost the key
             return "another has control now"
         return ""
 
@@ -65,7 +65,7 @@ class Driver:
         elif now >= self.asked_at + ASKS_S:
             self.asked_at = now
             self.request("hold")
-            self.robot.show_holder(self.id)
+            self.robot.show_holder(self.id)  # prints who has control, if that is another client
 
     def release(self):
         self.request("release")

@@ -45,7 +45,7 @@ class Described:
         self.ctrl_c = _CTRL_C  # a DESCRIBE_REQ begins with 3, which is Ctrl-C: see common/run.py
         self.decoder = Decoder()
         self._manifest, self._hello = manifest, hello
-        self._others = 0  # number of the newest frame of no interface: a gap shows lost ones
+        self._others = 0  # number of the newest frame of `notify`: a gap shows the host lost ones
         self._lost = 0  # frames for which there was no room
         self.asked = False  # for a DESCRIBE, which has not been sent yet
         self.notify(manifest[:hello], _HELLO)

@@ -94,20 +94,20 @@ class EmergencyStop:
         except (ValueError, OverflowError, MemoryError):
             return
         self.changed = True
-        if order and self.latch.reset(order[0], order[1], 0, now):
+        if order and self.latch.reset(order[0], order[1], 0, now):  # boot, count, and no age: it was read just now
             self._unsaved = True
 
     # -- the state
 
     def request(self, raw: memoryview, by: str, urgent: bool, now: int) -> None:
-        """Handle a request for control, or its end; ``urgent``: take it without asking."""
+        """Handle a request for control, or its end. ``by``: the account; ``urgent``: take control without asking."""
         try:
             order = request_of(fields(self._load(raw, by)))
         except (ValueError, OverflowError, MemoryError):
             return
         if order:
             name, person, device, ms = order
-            if ms:
+            if ms:  # 0: a release
                 self.lease.hold((by, name, person, device), ms, urgent, now)
             else:
                 self.lease.release((by, name), now)

@@ -55,7 +55,7 @@ class Clock:
                 self._close(now)
                 self._nonce = random.getrandbits(32).to_bytes(4, "big") * 2
                 self._open = Query(address, 123, sntp.request(self._nonce), now)
-            elif address is not None or age >= _LOOKUP_MS:
+            elif address is not None or age >= _LOOKUP_MS:  # "": the name has no address
                 self._close(add(now, _RETRY_MS))
 
     def _close(self, due: int) -> None:

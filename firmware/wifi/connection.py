@@ -61,7 +61,7 @@ class Connection:
     def lost(self, now: int, random: int) -> None:
         """Note that a connection was lost or not made; ``random`` 0..255 spreads the attempts of many robots."""
         self.losses += 1
-        # no failure: the Wi-Fi is away, or the connection was stable, which has reset the wait
+        # a failure, unless the Wi-Fi is away, or the connection was stable, which has reset the wait
         if self.state != "offline" and (self.state != "online" or self._next_wait != _FIRST_WAIT_MS):
             self.failures += 1
         wait = self._next_wait

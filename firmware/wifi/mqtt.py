@@ -54,7 +54,8 @@ class Client:
         """
         data = self.data
         self._end += count
-        while not self._more and len(self.out) - self.waiting > 6:  # out has room: for an answer, and for a ping
+        # Nothing is read while what is sent waits for room in ``out``. 6: an answer, and a ping.
+        while not self._more and len(self.out) - self.waiting > 6:
             skipped = min(self._skip, self._end - self._at)
             self._skip -= skipped
             start = at = self._at = self._at + skipped

@@ -86,7 +86,7 @@ class NetworkRobot:
         self.body.stop()
 
     def _guard(self, now: int) -> None:
-        """Stop the motors if control has passed on or their time is over; let the body repeat what was not received."""
+        """Stop the motors if control has passed on or no command came in time; let the body send again what failed."""
         stops = self.stops
         stops.tick(now)
         if stops.lease.halts:  # each new driver begins with wheels at rest
@@ -137,6 +137,7 @@ class NetworkRobot:
             # A stop counts without an account, too: its topic without one is among the first.
             self.stops.stoppable = results[_ESTOP] <= 127 and granted[_RESET] <= 127
             self.stops.controllable = granted[_CONTROL] <= 127
+            # The topic of groups is the last one. A body that takes none has no ``groups``, whatever is last then.
             self.groups = getattr(self.body, "groups", b"") if granted[-1] <= 127 else b""
             self._heartbeats = 0
             self._due = now
@@ -202,7 +203,7 @@ class NetworkRobot:
             axes = getattr(self.body, "axes", b"")
             text = describe(now_ms, session.root, self.name, stops, self.charging, axes, self.groups)
             session.publish(b"capabilities", text, 1)
-            stops.changed = stops.lease.changed = True
+            stops.changed = stops.lease.changed = True  # on a new connection the states follow, changed or not
             self._due = now  # the first heartbeat
         else:
             self._due = add(self._due, _HEARTBEAT_MS)

@@ -124,7 +124,7 @@ class Session:
             count = self._open.read(space) if len(space) else 0
             if count:
                 self._received = now
-            elif len(space) == len(client.data):  # and nothing is left from the last turn
+            elif len(space) == len(client.data):  # nothing has come, and the buffer is empty: no packet waits in it
                 break
             kind = client.take(count)
             while kind:
@@ -144,7 +144,7 @@ class Session:
                         self.connection.move("online", now)
                 else:
                     self._take(kind, now)
-                kind = client.take()
+                kind = client.take()  # another packet of the same bytes
             if count < len(space):
                 break
 

@@ -24,7 +24,7 @@ class Stream:
     def __init__(self, host: str, port: int, wrap) -> None:
         """Start to connect; ``wrap`` puts TLS around the connected socket; None: no TLS."""
         self.wrap = wrap
-        self._tried = 0
+        self._tried = 0  # bytes of a write that must be repeated; 0: none
         self._poll: select.poll | None = select.poll()
         self.socket = socket.socket()
         try:

@@ -14,7 +14,7 @@ class Wifi:
     def __init__(self, ssid: str, password: str) -> None:
         self._login = ssid, password
         self._tried: int | None = None  # when it was last connected, or last tried to be
-        self._server = ""
+        self._server = ""  # the DNS server, while connected
         network.WLAN(network.AP_IF).active(False)  # an ESP8266 starts an open access point
         self._wlan = network.WLAN(network.STA_IF)
         self._wlan.active(True)

@@ -84,11 +84,11 @@ class _Pebble(TyperGroup):
     def format_help(self, ctx: Any, formatter: Any) -> None:
         usage = f"Usage: {ctx.command_path} COMMAND …  (also: --version, COMMAND --help, --install-completion)\n"
         formatter.write(usage)
-        before = ""
+        last_group = ""
         for name, row in self._offered.items():
-            if " " not in name:
-                formatter.write(f"{'' if row.group == before else row.group:<9}{name:<12}{row.help}\n")
-                before = row.group
+            if " " not in name:  # subcommands are in the help of their command
+                formatter.write(f"{'' if row.group == last_group else row.group:<9}{name:<12}{row.help}\n")
+                last_group = row.group
 
 
 class _Listed(TyperCommand):

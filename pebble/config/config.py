@@ -114,7 +114,7 @@ def load(
     """
     path = Path(path).absolute()
     raw = decode(read_text(path), path.name)
-    if isinstance(raw, Pairs) and (keys := dict(raw).keys()) & {"robots", "tags"} and "robot" not in keys:
+    if isinstance(raw, Pairs) and "robot" not in (keys := dict(raw)) and ("robots" in keys or "tags" in keys):
         raise ConfigError(f"{path.name}: this is a world file, for pebble sim world; name the config file of a robot")
     return _config(raw, path, path.parent, env, lenient=lenient, core_only=core_only)
 
@@ -153,16 +153,16 @@ def _config(
     notes = Notes()
     written = plain(raw, notes)
     available, lacking = _extensions(written, folder)
-    installed, missing = ((), ()) if core_only else (available, lacking)
+    installed, missing = ((), ()) if core_only else (available, lacking)  # those that count here
     about_missing = [Note(tuple(extension.key.split(".", 1)), extension.reason) for extension in missing]
     (notes.warnings if lenient else notes.problems).extend(about_missing)
     file_class, config_class, rules = _classes(installed)
     reader = Reader(folder, env, rules, notes, file=path, other_forms=True)
     merged = with_instances(written)
-    unused = extensions.keys_of_missing(installed)  # else they would be unknown keys, as no class has them
+    ignored_keys = extensions.keys_of_missing(installed)  # else they would be unknown keys, as no class has them
     if core_only:
-        unused += [key for extension in available for key in extension.sections]
-    root = reader.section(file_class, without(merged, unused))
+        ignored_keys += [key for extension in available for key in extension.sections]
+    root = reader.section(file_class, without(merged, ignored_keys))
     notes.forget_inherited(written, merged)
     if path is not None and holds_secret(written):
         warn_if_readable(notes, (), path, "it, and there is a password in it")
@@ -256,7 +256,7 @@ def _guarded(owner: Extension, rule: Check) -> Check:
     def check(reader: Reader, section: Any, path: problems.Path) -> Any:
         try:
             checked = rule(reader, section, path)
-        except Exception as error:  # noqa: BLE001 - a stranger's
+        except Exception as error:  # noqa: BLE001 - whatever foreign code raises
             problem = f"failed: {type(error).__name__}: {error}"
         else:
             if isinstance(checked, type(section)):
@@ -319,8 +319,8 @@ def resolved(config: Config) -> dict[str, Any]:
 
     Keys that are not set and have no default are left out; secrets and the values of variables read ``***``.
     """
-    derived = {*Config.__struct_fields__} - {*Root.__struct_fields__}
-    names = [name for name in config.__struct_fields__ if name not in derived and name != "schema_"]
+    not_in_file = {*Config.__struct_fields__} - {*Root.__struct_fields__}
+    names = [name for name in config.__struct_fields__ if name not in not_in_file and name != "schema_"]
     keys = {name: masked(getattr(config, name), name) for name in names}
     return keys | {
         "derived": {

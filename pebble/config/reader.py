@@ -49,7 +49,7 @@ class Reader:
         file: Path | None = None,
         other_forms: bool = False,
     ) -> None:
-        self.file = file or folder
+        self.file = file or folder  # only its owner matters, see `read_for`
         self.folder, self.env, self.notes, self._other_forms = folder, env, notes or problems.Notes(), other_forms
         self.password_variables: dict[str, None] = {}  # the names that were read, in order
         self._rules = rules
@@ -67,7 +67,7 @@ class Reader:
         for written, value in pairs:
             key = self._key(kind, keys, written, (*path, written))
             field = keys.get(key)
-            if field is None or value in ("", None):
+            if field is None or value in ("", None):  # `_key` has noted it; or it is not set, which "" and null mean
                 continue
             if self._other_forms and value == [] and isinstance(field.default, tuple):  # for the original: unset
                 continue
@@ -150,7 +150,7 @@ class Reader:
         must_be = f"must be {expected(kind, metas)}" + ("" if tells_nothing else f", not {shown}")
         reading = reading_of(annotation, kind, metas, raw, default) if self._other_forms else None
         if reading is not None and reading.differs:
-            is_set = bool(reading.value) or reading.value == 0
+            is_set = bool(reading.value) or reading.value == 0  # 0 and false are values
             used = f"{msgspec.json.encode(reading.value).decode()} is used" if is_set else "it counts as not set"
             self.notes.warning(path, f"{must_be}; {used}")
             return reading.value

@@ -6,17 +6,22 @@ HIDDEN = "***"
 _NAMES = "pass|secret|token|credential|(?:api|access|private|auth).?key"
 _KEY = re.compile(_NAMES, re.IGNORECASE).search
 _NAME = rf"[\w-]{{0,40}}(?:{_NAMES}|pwd)[\w-]{{0,40}}"
-_WORD = re.compile(rf"(\b(?:{_NAME}|[\w-]{{0,40}}\bsig(?:nature)?)=)[^&\s]+", re.IGNORECASE)  # of a query or an option
+_PAIR = re.compile(rf"(\b(?:{_NAME}|[\w-]{{0,40}}\bsig(?:nature)?)=)[^&\s]+", re.IGNORECASE)  # of a query or an option
 _END = r"(?<!_file)(?<!_env)"  # of a name; what is in a file or a variable stays there
-#: A member of an object in JSON, and in JSON that is itself a text there.
-_MEMBER = re.compile(rf'("{_NAME}{_END}"\s*:\s*")(?:[^"\\]|\\.)+|(\\"{_NAME}{_END}\\"\s*:\s*\\")[^"\\]+', re.IGNORECASE)
+#: A member of an object in JSON, in JSON that is itself a text there, and in Python's writing.
+_MEMBER = re.compile(
+    rf'("{_NAME}{_END}"\s*:\s*")(?:[^"\\]|\\.)+'
+    rf'|(\\"{_NAME}{_END}\\"\s*:\s*\\")[^"\\]+'
+    rf"|('{_NAME}{_END}'\s*:\s*')(?:[^'\\]|\\.)+",
+    re.IGNORECASE,
+)
 is_secret_option = re.compile(rf"--?{_NAME}", re.IGNORECASE).fullmatch
 # URLs in a URL are percent-encoded: %3A is a colon, %2F a slash, %40 an @.
 _AT = re.compile("@|%40")
 _SLASHES = re.compile("://|%3A%2F%2F", re.IGNORECASE)
 _COLON = re.compile("(?<=[^\"'/]):(?![\"'])|^:|%3A", re.IGNORECASE)
 _BEFORE_USER = re.compile("[/\"'=,;(\\[{<]|%2F", re.IGNORECASE)
-_WITH_BLANKS = re.compile(r"(://)[^\s/@:]{0,100}:(?!\d{1,5}(?:[\s/?#\"',;]|$))[^@\n]{0,200}@")
+_LOGIN_WITH_BLANKS = re.compile(r"(://)[^\s/@:]{0,100}:(?!\d{1,5}(?:[\s/?#\"',;]|$))[^@\n]{0,200}@")
 
 
 def is_secret(key: str) -> bool:
@@ -30,9 +35,9 @@ def without_secrets(text: str) -> str:
     It rather hides too much: in a word with ``://``, or a colon before an @, everything before the last @.
     """
     if _AT.search(text):
-        text = re.sub(r"\S+", _without_login, _WITH_BLANKS.sub(rf"\1{HIDDEN}@", text))
-    text = _WORD.sub(rf"\1{HIDDEN}", text) if "=" in text else text
-    return _MEMBER.sub(lambda match: f"{match[1] or match[2]}{HIDDEN}", text) if '":' in text else text
+        text = re.sub(r"\S+", _without_login, _LOGIN_WITH_BLANKS.sub(rf"\1{HIDDEN}@", text))
+    text = _PAIR.sub(rf"\1{HIDDEN}", text) if "=" in text else text
+    return _MEMBER.sub(lambda match: f"{match[match.lastindex or 0]}{HIDDEN}", text) if ":" in text else text
 
 
 def _without_login(match: re.Match[str]) -> str:

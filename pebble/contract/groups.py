@@ -37,7 +37,7 @@ def decode(raw: bytes) -> tuple[Member, ...]:
     if len(raw) > MOST_BYTES:
         raise PayloadError(f"{c.GROUP.metric}: {len(raw)} bytes, more than {MOST_BYTES}")
     codec.plain(c.GROUP, raw)  # within the limits of all commands
-    commands = _unique_keys(codec.trim(raw))
+    commands = _strict_json(codec.trim(raw))
     by = commands.pop(BY, None) if isinstance(commands, dict) else None
     if not isinstance(commands, dict) or not 1 <= len(commands) <= MOST_MEMBERS:
         raise PayloadError(f"{c.GROUP.metric}: an object of 1 to {MOST_MEMBERS} commands is needed")
@@ -62,8 +62,8 @@ def _member(metric: str, command: Any, by: Any) -> Member:
     return Member(channel, metric, codec.decode(channel, payload), payload)
 
 
-def _unique_keys(text: bytes) -> Any:
-    """Return the JSON value in ``text``. Raises PayloadError if a key occurs twice in an object, in any spelling."""
+def _strict_json(text: bytes) -> Any:
+    """Return the JSON value in ``text``. Raises PayloadError for an infinite number, or a key twice in any spelling."""
     import json  # the only reader that shows it, and only robots with groups pay for it
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

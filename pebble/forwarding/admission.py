@@ -18,7 +18,7 @@ class Admission:
     """Limits on size, and on the number of actions and of messages that the contract does not know.
 
     Of unknown flags from outside a limited number is admitted. Flags from the robot's side are always admitted, and
-    count as well: so a restarted bridge counts those again that it had passed on before.
+    count as well: there a restarted bridge finds the retained ones that it had passed on before.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:

@@ -79,7 +79,7 @@ class Cycles:
         self._lock = threading.Lock()
         self._ways: dict[tuple[Side, str], _Way] = {}
         self._ours: dict[bytes, Side] = {}  # our probes, and the side each was sent to
-        self._others: dict[tuple[Side, bytes], bool] = {}  # probes of other bridges that were relayed
+        self._others: dict[tuple[Side, bytes], bool] = {}  # probes of other bridges that were relayed; an ordered set
         self._stops: dict[tuple[Side, bytes], float] = {}  # when each was received last, by side and payload
         #: Messages from this side on this topic come back there if they are forwarded.
         self.closed_ways: Final[set[tuple[Side, str]]] = set()
@@ -87,7 +87,7 @@ class Cycles:
     def examine(self, side: Side, subject: Subject, message: Message) -> Finding:
         """Return the finding about a message from ``side`` that may be forwarded. Must be fast.
 
-        Counts the message, notes an answered probe. Messages that start something may pass even if they circulate.
+        Counts the message, notes an answered probe. If the topic circulates, a drive command does not pass; others may.
         """
         topic, payload = message.topic, message.payload
         if subject.is_stop:
@@ -100,7 +100,7 @@ class Cycles:
             way, now = self._ways.get((side, topic)) or self._way(side, topic), self._clock()
             count = way.count(payload, now)
             if way.closed:
-                may_pass = subject.runs or not is_one_shot  # the caller recognises such messages when they come back
+                may_pass = subject.runs or not is_one_shot  # `Publisher.is_echo` recognises them when they return
                 if not may_pass or count > SUSPICIOUS:
                     return Finding.CIRCULATES
             is_new_storm = count > STORM and not way.closed  # a closed way is known to circulate

@@ -74,7 +74,7 @@ class Mirroring:
         """True if no side sends our own messages back. Otherwise commands would be repeated, even after a stop."""
         if all(state.transport.exact_echo for state in self._sides.values()):  # then echo=False is kept to
             return True
-        if not self._was_refused:
+        if not self._was_refused:  # it is logged once
             self._was_refused = True
             log.error(
                 "remote-mirror is refused: a broker sends our own messages back; use one with bridge mode "
@@ -117,7 +117,7 @@ class Forwarder:
             (side, SideState(side, transport, self.counters, clock, wins=side is winner))
             for side, transport in transports.items()
         )
-        #: Results of :func:`route`. There are few subjects, so no bound is needed.
+        #: Results of :func:`route` by its arguments, see _route. There are few subjects, so no bound is needed.
         self._routes: dict[tuple[Side, Subject, QoS, bool, bool | None, bool], Forward | Drop] = {}
         self._admission = Admission(clock)
         self.ages = CommandAges()
@@ -144,7 +144,7 @@ class Forwarder:
         for drop, side in itertools.product(_BOUNDS, Side):
             counts[drop.name.lower()] += self.counters[f"{side.value}: {drop.value}"]
         counts["events"] = self.counters["events_dropped"]
-        if shed := self.counters["shed"]:
+        if shed := self.counters["shed"]:  # counted by an extension, on thin links
             counts["shed"] = shed
         return dict(counts)
 
@@ -196,7 +196,7 @@ class Forwarder:
             routed = self._receive_named(source, self._names, message)
         else:
             subject = self.subjects[message.topic]
-            outcome = self.admit(source, subject, message, message.topic, True)
+            outcome = self.admit(source, subject, message, message.topic, True)  # True: no name is needed
             if subject is not None and isinstance(outcome, Forward):
                 outcome = self.pass_on(source, subject, message, outcome, "")
             routed = Routed(subject, outcome)
@@ -209,7 +209,7 @@ class Forwarder:
     def _receive_named(self, source: SideState, names: Names, message: Message) -> Routed:
         """Forward a message whose sender is checked: the name moves from the topic into the payload."""
         sender = names[message.topic]
-        subject, by = sender.subject, sender.account  # Signed, below, adds the person for whom the account acts
+        subject, by = sender.subject, sender.account  # by: a Signed, below, adds the person for whom the account acts
         outcome = self.admit(source, subject, message, sender.topic, by != NO_ACCOUNT)
         if subject is None:
             outcome = sender.foreign  # why the topic means nothing to this robot
@@ -288,7 +288,7 @@ class Forwarder:
         for name, step in self._steps.items():
             try:
                 why = step(source.side, subject, message)
-            except Exception as error:  # noqa: BLE001 - whatever a stranger's code raises: it is no refusal
+            except Exception as error:  # noqa: BLE001 - whatever foreign code raises: it is no refusal
                 self._quiet_log.warning(name, "the extension %s failed at %s: %r", name, message.topic[:_LOGGED], error)
                 continue
             if why:
@@ -325,7 +325,7 @@ class Forwarder:
         tells_age = forward.stamped and STAMP_LETTER in message.payload and STAMP in message.payload
         waited_s = self.ages.waited_s(subject, message, account) if tells_age else message.waited_s
         late = waited_s > subject.waits_s and not ends_something(subject, message)
-        # Many late commands show a flood; not those that tell their age, whose senders keep to the pace of the link.
+        # Many late commands show a flood, but not those that tell their age: their senders keep to the link's pace.
         if forward.stamped and not (late and tells_age):
             self.note_age(late)
         return late
@@ -370,9 +370,9 @@ class Forwarder:
                 self.publisher.probe(side, message.topic, message.payload)
                 return None
             case Finding.RELAY:
-                relayed = Forward(forward.qos, False, forward.urgent)
+                relayed = Forward(forward.qos, False, forward.urgent)  # False: not retained
                 self.publisher.publish(self.sides[side.other], subject, message, relayed)
-        return Drop.PROBE  # also for RELAY: it has been sent on here
+        return Drop.PROBE  # of RELAY, too: that probe was sent on above
 
     def _hold_event(self, target: SideState, message: Message) -> Drop:
         if self.gate is Gate.SHUT:

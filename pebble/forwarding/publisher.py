@@ -69,7 +69,7 @@ class Publisher:
         topic, payload = message.topic, message.payload
         if (source.side, topic) in self._cycles.closed_ways and source.returns.is_echo(topic, payload):
             return True
-        # `loopback` is of the broker that it was published to. Retained ones are recognised by their values instead.
+        # No other bridge, then, but maybe the side's own broker. Retained ones are recognised by their values instead.
         if source.transport.exact_echo or message.retain or not subject.is_two_way:
             return False
         return source.loopback.is_echo(topic, payload)
@@ -99,7 +99,7 @@ class Publisher:
         subject, target = self._subjects[topic], self._sides[side.other]
         if subject is None or not target.connected:
             return
-        # White space behind the topic's value, or alone: a command must not run again.
+        # White space behind the topic's value; of a one-shot kind alone, because a copy of a command would run again.
         before = b"" if subject.kind.one_shot else value
         if subject.kind.one_shot or _is_json(value):
             probe = before + self._cycles.probe(side, topic)

@@ -3,7 +3,7 @@
 A live message always counts, whichever side publishes it. `resolve` has the rules for the retained messages that a
 subscription brings. At a reconnect the *winner* side is right; the *loser* side only adds topics that the winner lacks.
 A side that has lost a value, or *went back* (was restored from an earlier save), receives the newest value again.
-Silence does not mean that a side has no value: the winner's value may arrive after the loser's was sent to it.
+Silence does not mean that a side has no value: the winner's may still arrive after the loser's was sent to the winner.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from pebble.forwarding.side import Gate, Sides, SideState
 from pebble.forwarding.subjects import Subject, Subjects
 from pebble.transports import Message, QoS
 
-_MAX_WAITING = 4096  # retained messages that wait for the gate to open
+_MAX_WAITING = 4096  # retained messages that wait for the gate to open; also topics in `SideState.seen`
 _DROPS = {Resolution.KNOWN: Drop.KNOWN, Resolution.HOLD: Drop.HELD}
 
 
@@ -121,7 +121,7 @@ class RetainedTopics:
     # -- with the lock held
 
     def _reconcile(self, source: SideState, subject: Subject, message: Message, *, only_old: bool) -> Drop | None:
-        """Return why a two-way message must not pass; None if it may. ``only_old``: a live message must not."""
+        """Return why a message of either side must not pass; None if it may. ``only_old``: no live message may pass."""
         side, topic, payload, transport = source.side, message.topic, message.payload, source.transport
         if message.retain and topic in source.seen and transport.policy.delivers_late and not transport.as_published:
             return Drop.KNOWN  # certainly retained, and came late: it is older than the live one before it

@@ -46,7 +46,7 @@ class RetainedWindow:
 
     def note(self) -> None:
         """Note a message with the retain flag. While such messages arrive, a stop may be an old one."""
-        now, until = self._clock(), self._stops_until
+        now, until = self._clock(), self._stops_until  # only the time for stops is put off: not _until
         if now >= until:
             return
         self._newest_at = now

@@ -25,7 +25,7 @@ class Gate(Enum):
 
 
 class SideState:
-    """A side: its transport, messages that wait for it or may come back, and its window of retained messages.
+    """A side: its transport, events that wait for it, messages that it may send back, and its window of retained ones.
 
     ``wins``: the retained messages of this side count where the two sides differ.
     """
@@ -37,10 +37,10 @@ class SideState:
         self.count_forwarded = counters.adder(f"{side.value}: forwarded")
         self.events = EventBuffer(transport, counters, clock=clock)
         self.window = RetainedWindow(transport, clock)
-        self.loopback = LoopbackFilter(clock)  # of a broker without bridge mode
-        self.returns = LoopbackFilter(clock, _RETURN_S)  # those on topics that circulate: each comes back once
+        self.loopback = LoopbackFilter(clock)  # what a broker without bridge mode sends back
+        self.returns = LoopbackFilter(clock, _RETURN_S)  # what we forward on topics that circulate: it comes back once
         self.seen: set[str] = set()  # two-way topics that have had a message since we subscribed
-        self.restarted = False  # its connection was lost, and the reconciliation is still to be told
+        self.restarted = False  # its connection was lost; the reconciliation does not know yet
         self._clock, self._wins = clock, wins
         self._lost_at = float("-inf")  # when its state was last another than connected; -inf: never
         # Its broker has restored older retained messages (if this side wins), or may have; False once all are here.
@@ -62,11 +62,11 @@ class SideState:
             self.subscribing()  # the transport does so at the next connection
             self.restarted = True
             self._lost_at = self._clock()
-            # A broker that ended may restore a save. Noted now: its retained messages may come before CONNECTED does.
-            # Of the side that wins it is noted at CONNECTED, and only if the transport has found older values there.
+            # A broker that ended may restore a save. Noted now, as its old messages may come before CONNECTED; for the
+            # side that wins only at CONNECTED, and only if the transport has found older values at its broker.
             self._went_back = not self._wins and self.transport.was_ended
         elif self._wins:
-            self._went_back = self._was_brief and self.transport.went_back  # else an operator may have set them
+            self._went_back = self._was_brief and self.transport.went_back  # brief: see RESTORED_S
 
     @property
     def has_gone_back(self) -> bool:

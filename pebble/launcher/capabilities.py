@@ -77,7 +77,7 @@ def _motor(
     """Return the offers of the motor MCU's serial line: drive, stop, lights and telemetry, with their topics in use."""
     lines, owned = config.motor_lines(), bool(config.motor_owners)
     present = bool(lines)
-    name = next(iter(lines), "")  # the first of several lines; "": the section, as the only line or for want of one
+    name = next(iter(lines), "")  # the first of several lines; "": the section is the only line, or there is none
     line = lines.get(name, config.services.serial_mcu_bridge)
     if name:
         addresses = Addresses(view_of(config, name))
@@ -130,11 +130,11 @@ def _imu(config: Config) -> tuple[bool, str]:
     return bool(lines), addresses[c.IMU].topic
 
 
-def _outlets(config: Config, found: Collection[str]) -> offers.OutletsOffer:
+def _outlets(config: Config, features: Collection[str]) -> offers.OutletsOffer:
     """Return the power outlets of the self-describing MCUs that are connected now, with their topics in use."""
     topics_of: dict[str, dict[str, str]] = {}  # by the outlet's name
     for key, channel in (("status_topic", c.OUTLET_STATUS), ("command_topic", c.OUTLET_COMMAND)):
-        for feature in sorted(found):
+        for feature in sorted(features):
             if name := channel.names(f"{config.base}/{channel.direction}/{feature}").get("outlet"):
                 topics_of.setdefault(name, {})[key] = channel.topic(config.base, outlet=name)
     outlets = [

@@ -71,7 +71,7 @@ class Driveable:
         before = self._mcus.get(program)
         self._mcus[program] = note
         if before is not None:
-            is_same = replace(before, silent_ms=None) == replace(note, silent_ms=None)
+            is_same = replace(before, silent_ms=None) == replace(note, silent_ms=None)  # but for the silence
             if is_same and _drives(before) == _drives(note):
                 return
         self._on_change()

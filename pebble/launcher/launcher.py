@@ -70,11 +70,11 @@ class Launcher:
         """
         config = self._config
         if config.path is not None:
-            # root must not run the commands that another user writes into a config
+            # root must not run the commands that another user writes into a config; there=True: it has to exist
             require_own(config.path, does="runs nothing of it", there=True)
         own_records = OwnRecords(self._logs, config.log_level)
-        in_state_dir = config.state_file("launcher").with_suffix(".lock")
-        with own_records, RunLock(config.run_dir(), config.base, in_state_dir) as lock:
+        lock_in_state_dir = config.state_file("launcher").with_suffix(".lock")
+        with own_records, RunLock(config.run_dir(), config.base, lock_in_state_dir) as lock:
             self._signals.install()
             try:
                 self._reactor.every(_RUN_DIR_S, lambda: self._keep(lock))
@@ -116,7 +116,7 @@ class Launcher:
         )
 
     def _driveable_by(self, running: Collection[str]) -> Driveable:
-        """Return the judge of the motors that the programs ``running`` own."""
+        """Return the `Driveable` of the programs ``running``: of their motors, and of serial lines without motors."""
         lines = {program_of(name): self._config.motor_owner(name) for name in self._config.serial_instances()}
         by_extensions = {program: name for name, program in motors_of(self._config.installed, self._config).items()}
         owners = [*map(program_of, self._config.motor_lines()), *by_extensions]
@@ -183,7 +183,7 @@ class Launcher:
     def _stop_stage(self, supervisors: Sequence[ProcessSupervisor], limit_s: float) -> None:
         for supervisor in supervisors:
             supervisor.stop()
-        if self._signals.received > 1:
+        if self._signals.received > 1:  # a second one asks to end at once
             self._kill_all()
         if not self._reactor.run_until(lambda: not _running(supervisors), limit_s):
             log.warning("did not stop in time: %s", ", ".join(_running(supervisors)))

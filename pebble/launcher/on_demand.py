@@ -33,7 +33,7 @@ class OnDemand:
         return tuple(name for name in self._supervisors if self._wanted.get(name))
 
     def environment(self, program: Program) -> dict[str, str]:
-        """Return variables for a new process: what an earlier one has requested, or the encoding to begin with."""
+        """Return a new process's variables: its last process's requests, or an on-demand program's encoding."""
         if program.may_request:
             return {WANTED: " ".join(f"{name}={self._encodings[name]}" for name in self.requested)}
         return {ENCODING: self._encodings[program.name]} if program.on_demand else {}

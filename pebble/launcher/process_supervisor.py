@@ -120,7 +120,7 @@ class ProcessSupervisor:
     def start(self) -> None:
         """Start the program, unless the robot is stopping."""
         if self._is_stopping():
-            self.stop()
+            self.stop()  # there is no child: this only sets the state
             return
         self.policy.started(self._reactor.now(), plain=self.program.plain)
         try:
@@ -271,7 +271,7 @@ class ProcessSupervisor:
         was_in_crash_loop = self.policy.in_crash_loop
         wait_s = self.policy.exited(self._reactor.now(), how)
         self._start_in(wait_s)
-        self._reactor.after(LOOP_WINDOW_S + 1.0, self._on_change)  # by then this exit is older than a minute
+        self._reactor.after(LOOP_WINDOW_S + 1.0, self._on_change)  # then the status no longer counts this exit
         name = self.program.name
         times = self.policy.exits_within_a_minute(self._reactor.now())
         if not self.policy.in_crash_loop:

@@ -44,9 +44,9 @@ class Control:
         self._named = security.named
         strangers = ("drive", "free", "refuse").index(security.unnamed)  # as the lease numbers these rules
         self.lease = lease_of(owner, owners, self.boot, ms(now), operator.sub, secrets.token_hex, strangers)
-        self.lease.vouched = (ms(now), ms(now)) if bridged else None
+        self.lease.vouched = (ms(now), ms(now)) if bridged else None  # begin and end: no time is vouched for yet
         self._turns = Paced(show_turn, _TURNS_PER_S)
-        self._turn_due = now if self.peers else None  # when the grant of control, the turn, is sent again
+        self._turn_due = now if self.peers else None  # when the grant of control, the turn, is sent again; None: never
         self._state = Paced(lambda: publish(self.state()))
         self._log = RateLimitedLog(log, burst=5)
         self._tick_due: float | None = None  # when the lease must be ticked next

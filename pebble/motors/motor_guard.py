@@ -163,7 +163,7 @@ class MotorGuard:
             self._state.changed(now)
 
     def save_again(self) -> None:
-        """Write the file once it can be written at all; write it again if the last write failed, or it was removed.
+        """Write the file as soon as that is possible; write it again if the last write failed, or the file was removed.
 
         It is not written again while a write is still running, or in a folder that is lost, where every write fails.
         """
@@ -185,7 +185,7 @@ class MotorGuard:
             return None
         latch = Latch("", NAMES, operator.sub)
         latch.restore(saved)
-        newest = latch.recent[0] if latch.recent else secrets.token_hex(8)
+        newest = latch.recent[0] if latch.recent else secrets.token_hex(8)  # an unreadable file is a stop, too
         if latch.latched and not self.latched and newest not in self._latch.recent:
             log.warning("%s has appeared, with an emergency stop", self._file.path)
             return EstopCommand(stop=newest, by=latch.by, why=latch.why)

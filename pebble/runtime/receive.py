@@ -48,7 +48,7 @@ class Refusals:
             try:
                 value = codec.decode(channel, message.payload, remark)
             except PayloadError as error:
-                if codec.is_blank(message.payload):
+                if codec.is_blank(message.payload):  # a bridge's probe for cycles, which is no mistake
                     self._counters.add("blank")
                 else:
                     self.malformed(channel, error)

@@ -104,7 +104,7 @@ class Service:
         self.timers = Timers()
         self.log_limited = RateLimitedLog(self.log)
         self.refusals = Refusals(self.log_limited, self.counters)
-        self._remarks = RateLimitedLog(self.log, period_s=60.0, most=_SENDERS)
+        self._remarks = RateLimitedLog(self.log, period_s=60.0, most=_SENDERS)  # on commands that are carried out
         self._inbox = Inbox()
         self._work = WorkLock()
         self._states: dict[str, tuple[Channel, bytes]] = {}  # the newest ones, by topic, to be published again
@@ -165,7 +165,7 @@ class Service:
         def deliver_direct(message: Message, value: Any, names: dict[str, str]) -> None:
             method(value, self.clock() - message.waited_s, **names)
 
-        deliver = deliver_direct if direct else partial(self._deliver, channel, method)
+        deliver = deliver_direct if direct else partial(self._deliver, channel, method)  # the latter only posts
         receive = self.refusals.reader(channel, deliver, self._remark)
         topic = self.addresses[channel].topic
         return self.transport.subscribe(topic, receive, qos=QoS(channel.default_qos), direct=True)
@@ -202,7 +202,7 @@ class Service:
             if self._inbox:
                 return False
             job()
-            if self.timers.next_due < work.wakes_at:  # by ``job``: the service's thread must not sleep until then
+            if self.timers.next_due < work.wakes_at:  # ``job`` has set an earlier timer than the service's thread knows
                 self._inbox.wake()
         except Exception as failure:  # noqa: BLE001 - raised again on the service's thread, which it ends
             self.post_first(partial(_fail, failure))
@@ -251,7 +251,7 @@ class Service:
             if job is not None:
                 job()
             self.timers.run_due(self.clock())
-            self._work.wakes_at = self.timers.next_due
+            self._work.wakes_at = self.timers.next_due  # for `run_if_idle` on other threads
         return job is not None
 
     def _tear_down(self) -> None:

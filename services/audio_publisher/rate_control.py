@@ -55,7 +55,7 @@ def steps(bundle: int, bitrate: int) -> tuple[Step, ...]:
 class RateController:
     """A controller of the packets that are sent, and of their Opus encoding (``step``).
 
-    ``outgoing()`` returns the unacknowledged messages. ``thin``: after a slow packet there is a pause.
+    ``outgoing()`` returns the unacknowledged messages. ``thin``: the link may be thin; a pause follows a slow packet.
     """
 
     def __init__(

@@ -203,7 +203,7 @@ class Catalogue:
             return _Answer(described, problem=str(error), broken=True)
         if not ours or not self._asks:  # this catalogue never runs a script
             return _Answer(described, ours, problem)
-        if not asks:
+        if not asks:  # it is ours, and is asked later
             return _Answer(described, True, problem, asked=False)
         command = self._command(folder, entry, section, described, ours=True)
         try:
@@ -269,11 +269,12 @@ def files(scripts: Iterable[Script]) -> list[dict[str, object]]:
         configs = form(script.settings)
         room -= len(msgspec.json.encode(configs))
         configs = configs if room >= 0 else []
-        entries.append({"file": script.file, "label": script.label, "configs": configs, **_first_seen(script, configs)})
+        entry = {"file": script.file, "label": script.label, "configs": configs}
+        entries.append(entry | _optional_fields(script, configs))
     return entries
 
 
-def _first_seen(script: Script, configs: Iterable[Mapping[str, object]]) -> dict[str, object]:
+def _optional_fields(script: Script, configs: Iterable[Mapping[str, object]]) -> dict[str, object]:
     """Return an entry's optional fields: ``summary``, ``main`` (settings to show first), ``asked`` (only if False)."""
     keys = {setting["key"] for setting in configs}
     first = {"summary": script.summary, "main": [key for key in script.main if key in keys]}

@@ -58,7 +58,7 @@ class Processes:
             release = self._guard.watch(process.pid, launch.tie)
         except OSError:
             process.signal(signal.SIGKILL)
-            process.watch(lambda _code: None)
+            process.watch(lambda _code: None)  # reaps it
             raise
 
         def on_end(code: int) -> None:

@@ -42,11 +42,12 @@ def facts(config: Config) -> Facts:
     except ModuleNotFoundError:  # a system without fcntl runs no robots
         return Facts()
     scans: list[dict[str, Script]] = []
-    Catalogue(config, asks=False).scan(scans.append)
+    Catalogue(config, asks=False).scan(scans.append)  # once, as no script is asked
     return Facts(table=tuple(("script", name, _fitness(config, script)) for name, script in scans[-1].items()))
 
 
 def _fitness(config: Config, script: Script) -> str:
+    """Return in words what runs the script and which modules are missing there, or why it does not run."""
     if script.broken:
         return f"does not run: {script.broken}"
     if script.ours:  # it uses pebble.script

@@ -47,7 +47,7 @@ class Guard:
             self._descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC, 0o600)
         except OSError as error:
             log.warning("%s cannot be opened: %s", self._path, error.strerror)
-            return
+            return  # scripts run all the same, as where the file system has no locks
         deadline = time.monotonic() + _LOCKED_S
         while not self._try_to_lock():
             if time.monotonic() > deadline:

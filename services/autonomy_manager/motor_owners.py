@@ -60,7 +60,8 @@ class MotorOwners:
         for barred in [state.last_barred for state in self._states.values()]:
             if not newer(run, barred):
                 ahead = (run - barred) & LAST_RUN
-                yield (barred + ahead // 2) & LAST_RUN or LAST_RUN  # half of the way; 0 is no run
+                half_way = (barred + ahead // 2) & LAST_RUN  # newer than ``barred``, and ``run`` is newer than it
+                yield half_way or LAST_RUN  # 0 is no run
 
     @property
     def refusal(self) -> str:
@@ -79,8 +80,8 @@ class MotorOwners:
     def ending(self, run: int, baseline: Baseline, signs: bool = True) -> str:
         """Return why this run must end; empty if it may continue. New owners are added to ``baseline``.
 
-        ``signs`` False: its script does not sign its commands. Owners take them for a person's and so bar the run at
-        once, which says nothing about people.
+        ``signs`` False: its script does not sign its commands. Owners take them for a person's, and bar the run at
+        once: here a barred run is no reason to end.
         """
         for owner, state in self._states.items():
             boot, count, barred = baseline.setdefault(owner, (state.boot, state.count, 0))
@@ -89,7 +90,7 @@ class MotorOwners:
             # An owner bars all runs up to a number: that before a run that begins, or the newest as a person drives.
             is_barred = state.last_barred != barred and not newer(run, state.last_barred)
             if signs and is_barred:
-                newer_began = state.last_barred != run or newer(self.newest_run, run)  # != : a later one
+                newer_began = state.last_barred != run or newer(self.newest_run, run)  # it is barred, or was received
                 return SUPERSEDED if newer_began else OVERRIDDEN
             if state.boot != boot:
                 return f"motor owner {owner} was restarted: start the script again"

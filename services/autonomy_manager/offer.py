@@ -27,7 +27,7 @@ class Offer:
         """Store the arguments. ``fixed`` replaces the folders in tests."""
         self.scripts = dict(fixed or {})
         self._fixed = fixed is not None
-        self.complete = self._fixed  # every folder was looked at once
+        self.complete = self._fixed  # the folders were searched at least once; fixed scripts have none
         self._config, self._post, self._on_change = config, post, on_change
         self._files: list[dict[str, object]] | None = None
         self._wanted, self._ended = threading.Event(), False

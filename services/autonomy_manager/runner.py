@@ -209,6 +209,7 @@ class Runner:
         self._service.later(self._stop_timeout_s, kill)
 
     def _on_end(self, run: Run, part: Part, code: int) -> None:
+        """Handle the end of a process: the others end with it, and after the last one the run is forgotten."""
         part.ended = True
         if run is not self._run:  # of a run that was closed
             return
@@ -219,7 +220,7 @@ class Runner:
             if not run.ending:
                 run.ending = True
                 self.error, self.stopped = f"{part.label} {how}" if code else None, False
-            self._end_dependencies(run)
+            self._end_dependencies(run)  # and forgets the run if all have ended
         else:
             if not run.ending:
                 self.error, self.stopped = f"dependency {part.label} {how}", False

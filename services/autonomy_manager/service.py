@@ -64,7 +64,8 @@ class AutonomyManager(Service):
         self.on_stop(processes.close)
         self._runner = Runner(self, spawn or processes, self._section.stop_timeout_seconds)
         self._offer = Offer(self.config, self.post, self._publish_files, scripts)
-        self._overridden_until = self._refused_until = float("-inf")
+        self._overridden_until = float("-inf")  # until then a person drives, not the script that runs
+        self._refused_until = float("-inf")  # until then the arbiter refuses scripts, so none is started
         self._status: AutonomyStatus | None = None
         self._connected_before = False
         self._waiting: Callable[[], None] | None = None  # a start, until its script is listed
@@ -82,6 +83,7 @@ class AutonomyManager(Service):
         self._runner.close(_CLOSE_S)
 
     def on_connected(self) -> None:
+        """At the first connection listen to who has control, and bar the run of a predecessor."""
         if not self._connected_before:
             self._connected_before = True
             self.listen(CONTROL_STATE, self._control)
@@ -97,13 +99,13 @@ class AutonomyManager(Service):
         word = (command.action or "").strip().lower()
         is_known = word in (*_START, *STOP_WORDS)
         begin = word in _START if is_known else command.enabled
-        self._waiting = None
+        self._waiting = None  # a newer command takes the place of a start that waits
         if begin is None:
             self.log_limited.warning("command", "ignored a command that neither starts nor stops a script")
         elif begin:
             by = command.by if isinstance(command.by, str) else None
             start = partial(self._start_script, (command.file or "").strip(), command.config or {}, by)
-            start(self.clock() + _LISTED_S)
+            start(self.clock() + _LISTED_S)  # until then it may wait for the list of scripts
         else:
             self._runner.stop()
 
@@ -122,7 +124,7 @@ class AutonomyManager(Service):
         except StartError as error:
             listing = isinstance(error, UnknownScriptError) and not self._offer.complete
             if listing and self.clock() < until:
-                self._wait(partial(self._start_script, file, config, by, until))
+                self._try_again(partial(self._start_script, file, config, by, until))
                 return
             why = f"{error}: scripts are still being listed, try again" if listing else str(error)
             self.log_limited.log("refused", logging.WARNING, "%s", why)
@@ -130,7 +132,7 @@ class AutonomyManager(Service):
         else:
             self._runner.start(wanted)
 
-    def _wait(self, start: Callable[[], None]) -> None:
+    def _try_again(self, start: Callable[[], None]) -> None:
         """Call ``start`` again soon, unless another command, a person who drives or an emergency stop comes first."""
 
         def again() -> None:
@@ -155,11 +157,11 @@ class AutonomyManager(Service):
         self._owners.receive(owner, state)
         if state.latched:
             self._waiting = None
-        run, stopped = self._runner.stoppable, bool(self._owners.refusal)
+        run, stopped = self._runner.stoppable, bool(self._owners.refusal)  # stopped: an owner is latched now
         if run is not None and (why := self._owners.ending(run.number, run.baseline, self._signs)):
             self._runner.stop(why, stopped=stopped)
-        if self._runner.stopped and not stopped:  # it was reset: scripts may start again
-            self._runner.refuse(None)
+        if self._runner.stopped and not stopped:  # its error is a stop, which was reset
+            self._runner.refuse(None)  # scripts may start again
 
     def _control(self, state: ControlState, owner: str) -> None:
         self._owners.receive_control(owner, state)
@@ -177,15 +179,16 @@ class AutonomyManager(Service):
             return
         elif self._signs or drive.key:  # a person's: the script would sign it, or have no key
             self._person_moves = drive.moves
-            self.post(self._person_drives, newest_of="person")
+            self.post(self._on_person_drives, newest_of="person")
             if not drive.moves and drive.valid_ms == 0:  # a final zero: no script resumes after it
-                self.post(self._person_stops, newest_of="person stops")
+                self.post(self._on_person_stops, newest_of="person stops")
         else:  # an unsigned script's, or a person's
             self._unsigned_moves = drive.moves
 
-    def _person_drives(self) -> None:
+    def _on_person_drives(self) -> None:
         """Let scripts wait for a person who drives, or end them, as the config says."""
-        now, self._waiting = self.clock(), None
+        now = self.clock()
+        self._waiting = None  # a start that waits is given up
         if self._runner.active is not None and self._runner.drives and self._section.on_override == "stop":
             self._runner.stop(OVERRIDDEN)
         if now >= self._overridden_until:
@@ -193,7 +196,7 @@ class AutonomyManager(Service):
         self._overridden_until = now + _HOLD_S
         self.changed()
 
-    def _person_stops(self) -> None:
+    def _on_person_stops(self) -> None:
         """End a script that does not sign its commands; refuse starts while the arbiter still refuses scripts."""
         self._refused_until = self.clock() + _HOLD_S
         self._end_unsigned()
@@ -231,7 +234,7 @@ class AutonomyManager(Service):
             self._local.release()
             raise
         self._signs, self._unsigned_moves = plan.main.script.ours, False
-        for number in self._owners.steps_to(run):  # else an owner may take this run for an older one
+        for number in self._owners.steps_to(run):  # zeros on the way, or an owner may take this run for an older one
             self.halt(number)
         return run, self._owners.baseline()
 

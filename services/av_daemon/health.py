@@ -60,7 +60,7 @@ class Health:
     def frame(self, info: FrameInfo, now: float, *, skipped: int = 0, content: int | str | None = None) -> None:
         """Note a frame. ``content`` differs between frames with different bytes; None: it was not computed."""
         self._dropped += skipped
-        if content is not None or self._info is None:  # without content its size is only what was asked for
+        if content is not None or self._info is None:  # without content ``info`` has only the size that was asked for
             self._info = info
         if content is not None:
             self._check.take(content, now)
@@ -94,6 +94,7 @@ class Health:
         return {} if info is None or asked is None else dict(self._problems(info, asked))
 
     def _problems(self, info: FrameInfo, asked: Asked) -> Iterator[tuple[str, str]]:
+        """Yield each problem of the frames: its kind, and its words."""
         check, sound, wrong_hz = self._check, info.rate > 0, self._check.wrong_hz
         if check.repeats:
             what = "gives the same sound" if sound else "shows the same picture"

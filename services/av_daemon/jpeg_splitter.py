@@ -20,8 +20,10 @@ class JpegSplitter:
         buffer += chunk
         while True:
             start = buffer.find(_START)
-            if start < 0:  # the last byte may be the beginning of a start
-                start = len(buffer) - buffer.endswith(_START[:1])
+            if start < 0:
+                start = len(buffer)
+                if buffer.endswith(_START[:1]):  # the beginning of a start, perhaps
+                    start -= 1
             del buffer[:start]
             end = _end(buffer)
             if end > 0:
@@ -30,7 +32,7 @@ class JpegSplitter:
                 if len(buffer) > self._limit:
                     buffer.clear()
                 return pictures
-            del buffer[: max(1, end)]  # of no picture only the first byte: another may begin in it
+            del buffer[: end if end > 0 else 1]  # of no picture only the first byte: another may begin in it
 
 
 def _end(buffer: bytearray) -> int:

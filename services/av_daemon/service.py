@@ -100,7 +100,7 @@ class AvDaemon(Service):
         if value == self._published:
             return
         only_numbers = self._published is not None and _states(value) == _states(self._published)
-        if not only_numbers or now - self._published_at >= _NUMBERS_S:
+        if not only_numbers or now - self._published_at >= _NUMBERS_S:  # numbers alone are not sent so often
             self._published, self._published_at = value, now
             self.publish(MEDIA_STATUS, MediaStatus(t=int(time.time() * 1000), value=value))
 

@@ -117,7 +117,7 @@ class Rotated:
         for broken in range(_BROKEN_LIMIT):
             capture = self._camera.grab()
             skipped += capture.skipped
-            if len(self._scratch) < capture.size and capture.draw is not None:  # drawn there; else it has its data
+            if len(self._scratch) < capture.size and capture.draw is not None:  # without `draw` it has its data
                 self._scratch = np.empty(capture.size, np.uint8)
             try:
                 original = picture(capture.pixels(self._scratch[: capture.size]), capture.info)

@@ -83,6 +83,7 @@ class V4l2Camera:
         return encoding if self._capture.set(self._cv2.CAP_PROP_CONVERT_RGB, 0) else "bgr24"
 
     def _first_picture(self) -> FrameInfo:
+        """Read a picture; return the metadata of what the camera really sends."""
         self._wait()
         first = self._retrieve()
         if self._format == "bgr24":

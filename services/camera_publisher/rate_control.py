@@ -180,9 +180,9 @@ class LevelControl:
         for memory in (self._seen, self._lost):
             while memory and now - memory[0][0] > _WINDOW_S:
                 memory.popleft()
-        stuck_s = age_s if age_s <= now - self._changed_at else 0.0  # sent since the last change
+        stuck_s = age_s if age_s <= now - self._changed_at else 0.0  # only if sent since the last change
         if stuck_s > _STUCK_S:
-            return self._go_down(max(stuck_s / self._frame_s, self._load), now)
+            return self._go_down(max(stuck_s / self._frame_s, self._load), now)  # the load is at least this frame's
         if now - self._changed_at < _MEASURE_S or not self._seen:
             self._good_since = now
             return False

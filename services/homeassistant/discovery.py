@@ -93,7 +93,7 @@ def _components(
         yield "charging", _binary("Charging", "battery_charging", topic(c.CHARGING_STATUS), "value")
     if video.get("encoding") == "jpeg":  # Home Assistant shows no other
         yield "camera", {"p": "camera", "name": "Camera", "t": topic(c.CAMERA)}
-    if video.get("controls") is True:  # not retained below a name: the bridge would drop it
+    if video.get("controls") is True:  # ret: the bridge drops a retained message on a topic with a name
         flag = {"p": "switch", "name": "Video", "stat_t": topic(c.MQTT_VIDEO), "val_tpl": _FLAG}
         yield "video", flag | {"pl_on": "true", "pl_off": "false"} | command(topic(c.MQTT_VIDEO)) | {"ret": not named}
     if section_of(capabilities, "lights").get("solid") is True:

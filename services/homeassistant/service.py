@@ -29,7 +29,7 @@ class HomeAssistantService(Service):
         self._remote = remote_transport(self.config, "homeassistant")
         self._place = f"{self._section.prefix}/device/{object_id(self.config.base)}/config"
         self._capabilities: dict[str, Any] = {}
-        self._unit = ""
+        self._unit = ""  # of the battery's level, as the robot publishes it
         self._wanted = self._sent = b""  # the discovery message: as it should be, and as it was sent last
         self._due = False  # it must be sent again, although it has not changed
         self._sent_at = float("-inf")

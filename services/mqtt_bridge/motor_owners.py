@@ -21,8 +21,8 @@ class MotorOwners:
         # By topic:
         self._messages = dict.fromkeys(self.topics, 0)  # how many arrived on this connection
         self._checked = dict(self._messages)  # the same number at the last check
-        self._waits_since: dict[str, float | None] = dict.fromkeys(self.topics)  # newest live one, or the first check
-        self._reported: dict[str, bool | None] = dict.fromkeys(self.topics)
+        self._waits_since: dict[str, float | None] = dict.fromkeys(self.topics)  # for the next live message
+        self._reported: dict[str, bool | None] = dict.fromkeys(self.topics)  # reached, as the launcher was told last
 
     def connected(self) -> None:
         """Note a new connection. Called on the transport's thread, like :meth:`receive`."""
@@ -37,7 +37,7 @@ class MotorOwners:
             count, count_before = self._messages[topic], self._checked[topic]
             self._checked[topic] = count
             waits_since, is_live = self._waits_since[topic], count > 1
-            if waits_since is None or (is_live and count != count_before):  # at the first check the time limit begins
+            if waits_since is None or (is_live and count != count_before):  # it waits from now on
                 waits_since = self._waits_since[topic] = now
             reached = now - waits_since < _MISSED_S
             if reached and not is_live:

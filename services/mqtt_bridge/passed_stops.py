@@ -71,7 +71,7 @@ class Owner:
                 self.withdrawn_at = now
             return
         self.withdrawn_at = None
-        # A restart proves no reset: its file may be older than the stop. A greater count: stopped between the states.
+        # After a restart it may be free without a reset, by an older file. A greater count: a stop between two states.
         was_stopped = (
             earlier is not None and earlier.boot == state.boot and (earlier.latched or state.count > earlier.count)
         )
@@ -108,11 +108,11 @@ class PassedStops:
             first = self._passed.setdefault(name, now)
             if len(self._passed) > NAMES:
                 del self._passed[next(iter(self._passed))]
-            waiting = {key for key, owner in self._owners.items() if _waits(owner, name)}  # owners without it, perhaps
+            waiting = {key for key, owner in self._owners.items() if _waits(owner, name)}  # owners that may lack it
             reset_since = {key for key, owner in self._owners.items() if owner.freed_at > first} - waiting
-            if reset_since:  # a repetition, noted as pending when it came first: the other owners get a copy
+            if reset_since:  # a repetition, pending since it came first: only the other owners get a copy
                 return [_addressed(stop, key) for key in self._owners if key not in reset_since]
-            for key, owner in self._owners.items():  # the newest stop of each stays pending
+            for key, owner in self._owners.items():  # of each owner the newest stop stays pending
                 has_newer = owner.pending is not None and owner.pending.first > first
                 if key not in waiting and not has_newer and not owner.confirms(name):
                     owner.pending = Pending(stop, first, now)

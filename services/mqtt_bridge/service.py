@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 _PROBE_WAIT_S = 0.1
 _AGAIN_WAIT_S = 1.0  # once a probe has come back: its way may be slow
 _RETRY_S = 1.0
-_IGNORED = (Drop.ECHO, Drop.LATE, Drop.PROBE)  # nothing that a person or a program requests of the bridge now
+_IGNORED = (Drop.ECHO, Drop.LATE, Drop.PROBE)  # dropped messages that are no request, or are too late to be one
 LEFTOVERS_AFTER_S = 30.0  # by then all services have published what they retain; so long after the start, or later
 _LOGGED = 200  # characters of a topic
 _CHECK_STOPS_S = 1.0
@@ -79,7 +79,7 @@ class MqttBridge(ForwardingService):
         deciding_owner = min(self.config.motor_owners, default="")  # of several, the first by name gives control
         self._control_topic = c.CONTROL_STATE.topic(self.config.base, owner=deciding_owner) if deciding_owner else ""
 
-        # Private topics, which never leave the robot: none without an extension. No group of commands may have one.
+        # Private topics never leave the robot: none without an extension. A group with a command on one is dropped.
         private = next((extension.private for extension in self.config.installed if extension.private), "")
         self._private = (part(private) if private else PrivateTopics)(self.config.base)
         self.forwarder.stays = self._private.stays
@@ -147,9 +147,9 @@ class MqttBridge(ForwardingService):
         if self.config.security.named:
             filters.append(with_name(self._stop_topic, "+"))
         make = partial(StopConnection, transport, filters, self._pass_stop, self._forwards, self.clock)
-        if not self._is_thin:
-            return make(notices_s=self._silence_s + _NOTICED_S)  # after that a lost connection is noticed
-        transport.suit_link(thin=True)  # there this connection is worth its cost only while a client floods the link
+        if not self._is_thin:  # over a thin link this connection is worth its cost only while a client floods it
+            return make(notices_s=self._silence_s + _NOTICED_S)
+        transport.suit_link(thin=True)
         notices_s = max(self._silence_s, LEVELS["thin"].silent_s) + _NOTICED_S
         return make(notices_s=notices_s, grace_s=_THIN_GRACE_S, wanted=lambda: self._uplink.is_flooded)
 
@@ -230,7 +230,7 @@ class MqttBridge(ForwardingService):
             self._check_brokers()
             return
         self._same_broker.send()  # the new connection may lead to another broker
-        if side is Side.REMOTE and epoch == self.epoch:
+        if side is Side.REMOTE and epoch == self.epoch:  # else it was lost: the next connection does it
             self.subscribe_remote()
 
     def subscribe_remote(self) -> None:
@@ -255,13 +255,13 @@ class MqttBridge(ForwardingService):
         """Open the forwarder's gate if the two sides cannot be one broker; otherwise begin a round of probing."""
         if not self._same_broker.possible:
             if self._same_broker.announces:
-                self._same_broker.send()  # a mirror of this very broker then shuts before anything is forwarded
+                self._same_broker.send()  # so a mirror of the remote broker shuts before anything is forwarded
             self._open()
         if self.forwarder.gate is Gate.OPEN or not self._same_broker.both_connected:
             return
-        round_ = self._same_broker.begin_round(self.subjects.topics(c.DRIVE)[0])  # which a broker has to allow
+        round_ = self._same_broker.begin_round(self.subjects.topics(c.DRIVE)[0])  # which is subscribed to anyway
         if round_ is not None:
-            wait_s = _PROBE_WAIT_S if self.forwarder.gate is Gate.WAITING else _AGAIN_WAIT_S  # SHUT: a probe came back
+            wait_s = _PROBE_WAIT_S if self.forwarder.gate is Gate.WAITING else _AGAIN_WAIT_S  # else a probe came back
             self.call_at(self.clock() + wait_s, partial(self._end_round, round_))
 
     def _end_round(self, round_: int) -> None:
@@ -372,7 +372,7 @@ class MqttBridge(ForwardingService):
         if epoch != self.epoch or self._private.stays(topic):
             return
         if topic == self._stop_topic:
-            if not self._has_passed(message):
+            if not self._has_passed(message):  # by the connection for stops alone
                 self._receive_stop(message)
             return
         self._react(Side.REMOTE, message, self.forwarder.receive(Side.REMOTE, message))
@@ -419,7 +419,7 @@ class MqttBridge(ForwardingService):
             self.refusals.stale("a command" if channel is None else channel.metric)
             return
         if isinstance(routed.outcome, Drop) and (routed.outcome in _IGNORED or not is_local):
-            return  # of what is not forwarded, only requests of the robot's programs count
+            return  # a dropped message may be a request only if it is a program's of the robot, and not one of these
         if channel is None or codec.is_blank(message.payload):
             return
         if not message.retain and routed.outcome is not Drop.KNOWN:  # observers see what is new

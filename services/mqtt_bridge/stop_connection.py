@@ -120,9 +120,9 @@ class StopConnection:
         self._transport, self._filters, self._clock = transport, tuple(filters), clock
         self._pass_on, self._main = pass_on, main
         self._copies = Copies(clock, notices_s)
-        self._failing_since = float("-inf")  # when it was last subscribed to stops, or not needed
+        self._failing_since = float("-inf")  # since when it fails: when it was last well, or not needed
         self._off_until = float("-inf")  # when it is tried again
-        self._connected_at = float("inf")
+        self._connected_at = float("inf")  # when it was made last; inf: never
         self._kicks = 0  # how often in a row the main connection was lost for it
         transport.policy.is_stop = lambda _topic: True  # it is subscribed to nothing else
         self._reported: bool | None = None  # the log says that it is there, or that it is not
@@ -158,7 +158,7 @@ class StopConnection:
     def main_lost(self, *, ended: bool) -> None:
         """Note that the main connection is lost; ``ended``: the broker has closed it."""
         self._copies.forget()
-        if self._clock() - self._connected_at >= _KICKED_S:  # this one is not why it was lost
+        if self._clock() - self._connected_at >= _KICKED_S:  # it was not lost because of this one
             self._kicks = 0
         elif ended and self.listens:
             self._kicks += 1

@@ -77,11 +77,11 @@ class MqttMirror(ForwardingService):
             self.forwarder.subscribed(Side.LOCAL)
             self.synchronize_later(Side.LOCAL)
             return
-        if epoch != self.epoch:
+        if epoch != self.epoch:  # that connection is lost already
             return
         if not self.remote.exact_echo:  # then echo=False is not kept to
             self._refuse('sends our own messages back; use one with bridge mode (mosquitto), or protocol "5"')
-        elif self.forwarder.gate is Gate.OPEN:  # checked on an earlier connection; a new probe shows another broker
+        elif self.forwarder.gate is Gate.OPEN:  # it was checked; the probe shows whether this is another one
             self.subscribe_remote()
             self._request_probe()
         else:

@@ -55,8 +55,8 @@ class NeighboursService(Service):
         self._estop = RobotEstop(self.config.base)
         begins = partial(begin, self.config.state_file("neighbour-runs"), self._section.commanded)
         self._visit = Visit(begins, self._number, partial(self.publish, DRIVE), self._local_runs)
-        self._received_at: dict[str, float] = {}
-        self._state: Neighbours | None = None
+        self._received_at: dict[str, float] = {}  # by robot: when its state came last, which shows its presence
+        self._state: Neighbours | None = None  # as published to operators last
 
     def start(self) -> None:
         self._lan.open(timeout=0.0)
@@ -167,7 +167,7 @@ class NeighboursService(Service):
             try:
                 return next_run(self.config, barred, received) if free else None
             except PebbleError as error:
-                self.log_limited.log("number", 30, "%s", error)
+                self.log_limited.log("number", 30, "%s", error)  # a warning
                 return None
 
     def _local_runs(self) -> bool:

@@ -82,7 +82,7 @@ class CmdVel:
 
     @property
     def alive(self) -> bool:
-        """True if commands are still repeated."""
+        """True if the thread that repeats commands still runs."""
         return self._thread.is_alive()
 
     @property

@@ -70,7 +70,7 @@ class Node:
         #: they were last told again that this node publishes the topic.
         self._missing: dict[tuple[str, str], float] = {}
         self._lost: dict[tuple[str, str], list[str]] = {}  # those to tell now, and the topic's publishers
-        self._is_lost = threading.Event()
+        self._wake_lost = threading.Event()  # wakes the thread that tells lost subscribers
         self._revived = 0  # how often a lost subscriber was told
         self._ends = threading.Event()
         self._threads: list[threading.Thread] = []
@@ -78,7 +78,7 @@ class Node:
         self._jobs: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # of the thread of sockets
         self._greetings: dict[Subscriber, float] = {}  # and when they began
         self._select = selectors.DefaultSelector()
-        self._waker, self._wakes = socket.socketpair()
+        self._waker, self._wakes = socket.socketpair()  # a byte into the first ends the wait for the second, in _select
         self._waker.setblocking(False)
         self._wakes.setblocking(False)
         self._listener = socket.create_server((host, 0), backlog=16)
@@ -109,7 +109,7 @@ class Node:
         for publication in self._publications.values():
             publication.finish()
         self._ends.set()
-        self._is_lost.set()
+        self._wake_lost.set()
         self._wake()
         with suppress(RosError):  # if one call fails, the others wait in vain, too
             for topic in self._publications:
@@ -245,12 +245,12 @@ class Node:
                 missing[topic, node] = now
                 self._lost[topic, node] = publishers.get(topic, [])
         self._missing = missing
-        self._is_lost.set()
+        self._wake_lost.set()
 
     def _run_lost(self) -> None:
         while not self._ends.is_set():
-            self._is_lost.wait()
-            self._is_lost.clear()
+            self._wake_lost.wait()
+            self._wake_lost.clear()
             while self._lost and not self._ends.is_set():
                 topic, node = next(iter(tuple(self._lost)))  # the oldest; a copy, as another thread adds to it
                 publishers = self._lost.pop((topic, node))

@@ -47,8 +47,8 @@ class Telemetry:
         self._metrics, self._names, self._publish = section.telemetry, section.ros, publish
         self._counters, self._on_odometry = counters, on_odometry
         self._log = RateLimitedLog(log)
-        self._due: dict[Channel, float] = {}
-        self._goal: dict[str, Any] | None = None
+        self._due: dict[Channel, float] = {}  # when a channel may be published again
+        self._goal: dict[str, Any] | None = None  # the newest one, which the status repeats
         self._navigates_at = float("-inf")  # when a planner was last seen to pursue a goal
         metrics, names = self._metrics, self._names
         battery = metrics.charging_level.enabled or metrics.charging_status.enabled
@@ -109,7 +109,7 @@ class Telemetry:
         read = messages.odometry(body)
         x, y, z = read.position
         yaw = messages.yaw(read.quaternion)
-        _refuse_odd(x, y, z, yaw, read.linear, read.angular)
+        _refuse_infinite(x, y, z, yaw, read.linear, read.angular)
         if wheels:
             value = {
                 "x_mm": round(1000 * x, 3), "y_mm": round(1000 * y, 3), "heading_rad": round(yaw, 6),
@@ -117,6 +117,7 @@ class Telemetry:
                 "angular_speed_radps": round(read.angular, 6),
             }  # fmt: skip
             stamp = _stamp(read.header)
+            # Unlike in what `_tell` publishes, the source is a fixed name, not a topic.
             payload = {"value": value, "unit": "mm", "source": "ros-odometry", "timestamp": stamp}
             self._publish(c.WHEEL_ODOMETRY, payload)
         if pose:
@@ -130,7 +131,7 @@ class Telemetry:
     def _take_goal(self, body: bytes) -> None:
         read: Pose = messages.pose(body)
         yaw = messages.yaw(read.quaternion)
-        _refuse_odd(*read.position, *read.quaternion)
+        _refuse_infinite(*read.position, *read.quaternion)
         turn = {name: round(part, 6) for name, part in zip("xyzw", read.quaternion, strict=True)}
         self._goal = {"frame_id": read.header.frame, **_place(read.position, yaw), "orientation": turn}
         if self._metrics.navigation_goal.enabled:
@@ -158,7 +159,7 @@ class Telemetry:
         step = (len(points) - 1) / (most - 1) if most > 1 else 0.0
         sample = [points[round(number * step)] for number in range(most)]  # with the first and the last
         for point in sample:
-            _refuse_odd(*point)
+            _refuse_infinite(*point)
         shown = [{"x_m": round(x, 6), "y_m": round(y, 6), "z_m": round(z, 6)} for x, y, z in sample]
         value = {
             "frame_id": header.frame, "point_count": len(points), "sampled_point_count": most, "points": shown,
@@ -179,10 +180,11 @@ class Telemetry:
             self._battery(part, _stamp(header))
 
     def _battery(self, part: Health, stamp: float) -> None:
+        """Publish the level and the status of charging that this part of the diagnostics has, each if it is due."""
         level, status = self._metrics.charging_level, self._metrics.charging_status
         if part.name == level.status_name and level.key in part.values:
             number = float(part.values[level.key])
-            _refuse_odd(number)
+            _refuse_infinite(number)
             if self._is_due(c.CHARGING_LEVEL, level, LEVEL_S):
                 payload: dict[str, Any] = {"value": number, "timestamp": stamp}
                 units = [unit for mark, unit in _UNITS.items() if mark in level.key]
@@ -197,6 +199,7 @@ class Telemetry:
                 self._publish(c.CHARGING_STATUS, {"value": charges, "timestamp": stamp})
 
     def _tell(self, channel: Channel, value: dict[str, Any], source: str, header: Header, **more: str) -> None:
+        """Publish ``value`` with the topic ``source`` and the time in the header."""
         self._publish(channel, {"value": value, **more, "source": source, "timestamp": _stamp(header)})
 
 
@@ -226,7 +229,7 @@ def _label(labels: tuple[str, ...], code: int) -> str:
     return labels[code] if 0 <= code < len(labels) else "UNKNOWN"
 
 
-def _refuse_odd(*numbers: float) -> None:
+def _refuse_infinite(*numbers: float) -> None:
     """Raise ValueError for a number that JSON cannot hold: NaN or an infinity."""
     if not all(map(math.isfinite, numbers)):
         raise ValueError("a number is not finite")

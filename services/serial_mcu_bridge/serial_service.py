@@ -131,14 +131,14 @@ class SerialService(Service, ABC):
             return
         idle, heard = now - line.output.sent_until >= CHECK_S, self._heard_since_opening()
         state, silent_ms = self._silence.check(line.state, line.opened, heard, now, idle=idle)
-        # bytes come, and no report in them is understood
+        # None: no report was understood since the line was opened, here although bytes have come
         misread = silent_ms is None and line.state is LineState.READY and line.received > 0
         sensor_problem = self.sensors.problem
         if sensor_problem and not self._sensor_problem:
             self.log.warning("%s", sensor_problem)
         self._sensor_problem = sensor_problem
         starts = self._starts.within_a_minute(line.opened, now)
-        misread_twice = misread and self._misread  # the first time a line may be under way
+        misread_twice = misread and self._misread  # once proves nothing: the first report may be under way
         problem = _MISREAD if misread_twice else line.problem or sensor_problem
         self._misread = misread
         self._reported.report(state, silent_ms, problem, starts)

@@ -74,7 +74,7 @@ class Clips:
             return None
 
     def _clip(self, path: Path | None, name: str) -> Clip | None:
-        """Return the clip at this path in the folder, or None. ``name`` replaces a name that is no text."""
+        """Return the clip at this path in the folder, or None. ``name``: the command's, for a path that is no text."""
         root = self._folder.resolve()
         if path is None or not path.is_relative_to(root) or path.suffix.lower() not in self._endings:
             return None
@@ -84,7 +84,7 @@ class Clips:
         except OSError:  # too long
             return None
         inside = path.relative_to(root).as_posix()
-        return Clip(inside if is_text(inside) else name, path)  # ``name`` is then that of a link to this file
+        return Clip(inside if is_text(inside) else name, path)  # no text: the command names a link to this file
 
     def _paths(self) -> Iterator[str]:
         """Yield the paths of the clips among the first _MOST files, as the folder has them."""

@@ -34,7 +34,7 @@ class Playback:
         self.clip = clip
         self.process: Child | None = None
         self.ended = self.stopped = False
-        self.problem = self._decoding_problem = ""
+        self.problem = self._decoding_problem = ""  # for operators; why the file could not be decoded to its end
         self.exit_code = 0
         self._config, self._post = config, post
         self._on_change = partial(on_change, self)

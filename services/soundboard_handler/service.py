@@ -93,7 +93,9 @@ class SoundboardHandler(Service):
             return None
         not_found = f"Sound file not found: {name[:_LONGEST_NAME]}"
         try:
-            clip = next(filter(None, map(self._clips.find, dict.fromkeys((name, name.strip())))), None)
+            clip = self._clips.find(name)
+            if clip is None and name != name.strip():
+                clip = self._clips.find(name.strip())
         except PebbleError as error:
             self._error = f"{not_found}: {error}"
             return None

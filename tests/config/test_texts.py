@@ -135,6 +135,8 @@ def test_a_secret_on_a_command_line_is_not_printed_again(run: Run) -> None:
         (f"x?token={SECRET}&y=1", "x?token=***&y=1"),
         (f"x?X-Sig={SECRET}&design=1", "x?X-Sig=***&design=1"),
         (f'{{"api_key": "{SECRET}", "x": 1}}', '{"api_key": "***", "x": 1}'),
+        (f'{{"password" : "{SECRET}"}}', '{"password" : "***"}'),
+        (f"{{'mqtt_password': '{SECRET}', 'port': 1}}", "{'mqtt_password': '***', 'port': 1}"),
         (f'"{{\\"api_key\\": \\"{SECRET}\\"}}"', '"{\\"api_key\\": \\"***\\"}"'),
         ('{"password_file": "x", "token": ""}', '{"password_file": "x", "token": ""}'),
     ],

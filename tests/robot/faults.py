@@ -18,7 +18,7 @@ from pebble.config import LAUNCHER_LOCK
 from tests.kit.mqtt_bytes import connect, publish
 from tests.robot.operator import Driver, Operator, number_of
 from tests.robot.rig import BASE, STOP, Rig
-from tests.support import gone, until
+from tests.support import SOON_S, gone, until
 from tests.transports.net import Forked
 
 AGE_S = 2.5  # no older command ever reaches the wheels
@@ -50,6 +50,7 @@ class Drive:
             "no driving after the fault's end"
         )
         self.back_s = time.monotonic() - over
+        assert self.back_s < 2 * SOON_S, f"driven again {self.back_s:.1f} s after the fault's end"
         self.finish()
 
     def finish(self) -> None:

@@ -170,7 +170,7 @@ class Connection:
             if now >= self.pings.due_at:
                 self.pings.send(client)
             owes = client.owes
-            if not owes:
+            if not owes:  # otherwise MQTT's acknowledgements carry TCP's
                 self._quick_ack()
             messages, incoming.messages = incoming.messages, []
             answers = incoming.answers
@@ -262,7 +262,7 @@ class Connection:
             if not limits.qos and client.unwritten > _UNWRITTEN and not self._owner.policy.is_stop(message.topic):
                 return False
             if message.retain and limits.retain:
-                self.in_flight.accept(message)
+                self.in_flight.accept(message)  # so that it is known while the broker has not confirmed it
             if message.qos is QoS.LATEST and client.waiting:
                 self._counters.add("dropped", self._backlog.put(message))
             else:
@@ -281,7 +281,7 @@ class Connection:
         return _OVERHEAD + len(message.topic.encode()) + len(message.payload) <= self.max_packet
 
     def _is_full(self, message: Message) -> bool:
-        """True if ``message`` is refused beyond UNACKED_LIMIT: all are, except UNACKED_RESERVE more emergency stops."""
+        """True if ``message`` is refused at UNACKED_LIMIT, as all are but the next UNACKED_RESERVE emergency stops."""
         beyond = self.in_flight.unacked - UNACKED_LIMIT
         return beyond >= UNACKED_RESERVE or not self._owner.policy.is_stop(message.topic)
 

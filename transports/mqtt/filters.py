@@ -21,10 +21,10 @@ def overlap(first: str, second: str) -> bool:
     """True if there is a topic that both filters match."""
     begin, other_begin = beginning(first), beginning(second)
     if not (begin.startswith(other_begin) or other_begin.startswith(begin)):
-        return False
+        return False  # the fast way, for most pairs of filters
     first_levels, second_levels = first.split("/"), second.split("/")
     if "$" in (first_levels[0][:1], second_levels[0][:1]) and first_levels[0] != second_levels[0]:
-        return False  # wildcards do not match a first level with a $
+        return False  # a first level with a $ is matched by the same text alone, not by a wildcard
     for first_level, second_level in zip(first_levels, second_levels, strict=False):
         if first_level == "#" or second_level == "#":
             return True

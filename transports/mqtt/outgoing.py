@@ -207,9 +207,9 @@ class InFlightTable:
         return self._unacked[mid][0] if mid in self._unacked else None
 
     def first_written(self, now: float) -> dict[str, int]:
-        """Return by topic the size of the largest recent message for which the broker may have closed the connection.
+        """Return by topic the size of the largest recent message that is the first of its topic, or of its size there.
 
-        The broker has accepted what was sent before an answered ping; on that topic only larger messages count.
+        Because of these the broker may have closed the connection: it has accepted all before an answered ping.
         """
         sizes: dict[str, int] = {}
         for written in [*(ping.written for ping in self._pings), self._written]:
@@ -270,7 +270,7 @@ class InFlightTable:
 
     @property
     def round_trip_s(self) -> float:
-        """The shortest recent round trip. By a longer one, of a delayed answer, a stall would be noticed too late."""
+        """The shortest recent round trip: a longer one includes a delay, and would let a stall be noticed too late."""
         return min(self._round_trips, default=0.0)
 
     def newest_answer(self, now: float) -> tuple[int, float]:

@@ -67,7 +67,7 @@ class BrokerDelay:
 
     def __init__(self) -> None:
         self._pings: deque[_Ping] = deque()  # oldest first
-        self._read_answer = self._delivered_answer = 0.0, 0.0  # when its ping was sent, and how long it took
+        self._read_answer = self._delivered_answer = 0.0, 0.0  # ping sent at, took; the second as at `delivered`
         self._shortest = _FAR_S
         self._newest = 0.0  # seconds that the newest answer took; 0: it tells nothing
         self._came_at = 0.0  # when something was received last
@@ -94,13 +94,13 @@ class BrokerDelay:
             took_s = now - ping.sent_at
             self._read_answer = ping.sent_at, took_s
             self._newest = took_s if ping.clear else 0.0  # else our own data held up the ping
-            self.usual(took_s)
+            self.usual(took_s)  # if it is the shortest
         is_near = self._shortest <= _NEAR_S  # else the answer to an older ping, too, may come soon after the newest one
         if is_near and self._pings and now - self._pings[-1].sent_at <= self._shortest + _NEAR_S:
             self._prompt += 1
         else:
             self._prompt = 0
-        if self._prompt >= _LOST:  # these answers belong to the newest pings: no ping is unanswered
+        if self._prompt >= _LOST:  # each was for the newest ping: earlier answers are lost, none is to come
             self._pings.clear()
             self._newest = 0.0
 
@@ -115,7 +115,7 @@ class BrokerDelay:
         self._delivered_answer = self._read_answer
 
     def delivery(self, now: float) -> tuple[float, float]:
-        """Return the age of the newest ping whose answer came before the last delivery, and how late answers are."""
+        """Return the age of the newest ping answered before :meth:`delivered` was called, and how late answers are."""
         sent_at, took = self._delivered_answer
         waits = now - self._pings[0].sent_at if self._pings else 0.0
         return now - sent_at, max(took, waits) - self._shortest

@@ -88,7 +88,7 @@ class RefusedTopics:
         """Note a lost connection. ``written``: by topic, sizes of messages that may be why; None if none can be."""
         written, trial, self._trial = written or {}, self._trial, None
         self._quiet_at = now + QUIET_S
-        ordinary = [topic for topic in written if not self._is_vital(topic)]
+        ordinary = [topic for topic in written if not self._is_vital(topic)]  # those that may be withheld at any size
         if trial is not None and ordinary == [trial.topic]:
             self._blame(where, trial.topic, written[trial.topic], now)
             return
@@ -99,7 +99,7 @@ class RefusedTopics:
             suspects = {topic: size for topic, size in often.items() if not self._is_vital(topic)}
         if len(suspects) == 1:
             self._blame(where, *suspects.popitem(), now)
-        elif suspects:  # any of them: their trials will show which
+        elif suspects:  # any of them, at any size (0): their trials will show which
             self.withheld |= {topic: Withheld(0, now) for topic in suspects if len(self.withheld) < TOPICS}
         elif not ordinary:  # only vital ones, which are sent all the same
             for topic, size in often.items():

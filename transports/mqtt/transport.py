@@ -60,8 +60,8 @@ class MqttTransport(Transport):
         if settings.protocol not in ("3.1.1", "5"):
             raise TransportError(f'protocol must be "3.1.1" or "5", not "{settings.protocol}"')
         self.settings = settings
-        self.as_published = settings.as_published
-        self.exact_echo = settings.as_published or settings.protocol == "5"
+        self.as_published = settings.as_published  # in bridge mode on 3.1.1, which also keeps own messages away
+        self.exact_echo = settings.as_published or settings.protocol == "5"  # 5 has noLocal for that
         self._dialler = Dialler(client_id, settings, will, self.client_class)
         self._connection: Connection | None = None  # the newest one, once it can be used
         self._filters = BrokerFilters()
@@ -125,7 +125,7 @@ class MqttTransport(Transport):
 
     def _send(self, message: Message, urgent: bool) -> bool:
         connection = self._connection
-        if connection is None or not (self._state is State.CONNECTED or self._own.syncing):
+        if connection is None or not (self._state is State.CONNECTED or self._own.syncing):  # see `_initial_sync`
             return False
         if not connection.takes(message):
             why = f"{len(message.payload)} bytes, but it takes packets of {connection.max_packet} at most"
@@ -135,7 +135,7 @@ class MqttTransport(Transport):
         if self._refused.withheld and not self._refused.admits(message, time.monotonic()):
             self.counters.add("withheld")
             return True  # here, too
-        expires_s = ceil(self.settings.silence_s) if urgent and not message.retain else None
+        expires_s = ceil(self.settings.silence_s) if urgent and not message.retain else None  # later it is stale
         if message.retain:
             self._own_message_filter.note_own(message)
         return connection.publish(message, expires_s=expires_s)
@@ -157,22 +157,22 @@ class MqttTransport(Transport):
                 return  # the next connection subscribes to them
             # Retained messages come after the SUBACK, on a bad network long after it; a ping's answer follows them.
             acks.append(connection.ping())
-        if self._network is None or threading.current_thread() is not self._network.thread:  # which reads the answers
+        if self._network is None or threading.current_thread() is not self._network.thread:  # it reads the answers
             deadline = time.monotonic() + _ANSWER_S
             for ack in acks:
                 ack.wait(deadline - time.monotonic())
 
-    def ask(self, topics: Collection[str]) -> None:
+    def ask(self, topics: Collection[str]) -> None:  # by subscribing to each exact topic until the answer has come
         deadline = time.monotonic() + _ANSWER_S
         with self._filters.lock:
-            connection, names = self._connection, [topic for topic in topics if topic not in self._filters]
-            if connection is None or not names:
+            connection, unheard = self._connection, [topic for topic in topics if topic not in self._filters]
+            if connection is None or not unheard:
                 return
-            for name in names:
-                self._own_message_filter.subscribe_again(name)
+            for topic in unheard:
+                self._own_message_filter.subscribe_again(topic)
             # Retained messages come after the SUBACK; the ping's answer follows them.
-            answer = connection.subscribe([(name, self._no_local(name)) for name in names], QoS.LATEST)
-            acks = [answer, connection.ping(), connection.unsubscribe(names)]
+            answer = connection.subscribe([(topic, self._no_local(topic)) for topic in unheard], QoS.LATEST)
+            acks = [answer, connection.ping(), connection.unsubscribe(unheard)]
         for ack in acks:
             ack.wait(deadline - time.monotonic())
 
@@ -280,7 +280,7 @@ class MqttTransport(Transport):
         """Send retained messages that were withheld, where a new attempt is due: the broker may refuse their topics."""
         with self._publishing:
             for message in self._refused.due(self._own, connection.where, time.monotonic()):
-                self._own.remember(message, sent=self._send(message, False))
+                self._own.remember(message, sent=self._send(message, False))  # not urgent
 
     def _report_limits(self, connection: Connection) -> None:
         limits = connection.limits

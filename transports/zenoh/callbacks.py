@@ -104,7 +104,7 @@ class Guard:
             if quiet < _REST:
                 continue
             self.rests = True
-            if not self._look():  # else a callback has begun that did not see it
+            if not self._look():  # else a callback has begun before `rests` was set, and woke no guard
                 self._wakeup.wait(None)
             self.rests, quiet = False, 0
 
@@ -124,8 +124,8 @@ class Guard:
         """Give another of Zenoh's threads something to do: the task that Zenoh starts for a query's time limit."""
         self.helped += 1
         with self._lock:
-            sessions = self._sessions[::-1]
-        for session in sessions:
+            sessions = self._sessions[::-1]  # a copy, the newest first
+        for session in sessions:  # one that works is enough: all share Zenoh's threads
             try:  # the query does not leave the session
                 session.get(_NOTHING, _nothing, timeout=_HELP_S, allowed_destination=zenoh.Locality.SESSION_LOCAL)
             except Exception:  # closed meanwhile; whatever it is, the guard goes on

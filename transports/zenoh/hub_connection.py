@@ -59,7 +59,7 @@ class HubConnection:
             self._removed.pop(message.topic, None)
         else:
             remember_first(self._removed, message.topic, None)
-        self._put(session, message, 0 if again else self.retained_count)
+        self._put(session, message, 0 if again else self.retained_count)  # 0: sent again
 
     def _put(self, session: zenoh.Session, message: Message, retained_count: int) -> None:
         stamp = wire.Stamp(message.qos, retained_count, self.name)

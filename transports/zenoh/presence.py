@@ -123,7 +123,7 @@ class Barrier:
                 log.warning("%s did not answer within %.1f s and will not be waited for again", names, timeout)
                 self._silent |= missing.keys()
                 break
-            if not self._ask(set(missing), answers, remaining_s):
+            if not self._ask(set(missing), answers, remaining_s):  # not all have answered
                 time.sleep(pause)
                 pause = min(2 * pause, longest)
         self._silent -= set(answers)

@@ -56,10 +56,10 @@ def unix_endpoint(path: Path) -> str:
 
 def _numbered(endpoint: str) -> str:
     """Return an endpoint, as tls/[fe80::1%eth0]:7447, with the number of the card, whose name Zenoh does not accept."""
-    start, zone, rest = endpoint.partition("%")
+    start, percent, rest = endpoint.partition("%")
     name, bracket, port = rest.partition("]")
     try:
-        return f"{start}%{socket.if_nametoindex(name)}]{port}" if zone and bracket else endpoint
+        return f"{start}%{socket.if_nametoindex(name)}]{port}" if percent and bracket else endpoint
     except OSError:  # it is a number already, or there is no such card, which Zenoh then reports
         return endpoint
 
@@ -87,7 +87,7 @@ def session_config(
 def open_session(config: str) -> zenoh.Session:
     """Open a session. Raises ZError if that fails now, TransportError if this process was forked with a session."""
     _refuse_fork()
-    # Read once, before the first session; here, because a forked service has another environment than this module's.
+    # Zenoh reads it once, at the first session. Set here: a fork replaces the environment in which this was imported.
     os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)
     # Zenoh's threads inherit this. A signal that the kernel gave to one of them would not wake the main thread, which
     # runs Python's handlers (measured: 5 of 200 hubs on a busy machine did not end).

@@ -48,7 +48,7 @@ class ZenohTransport(Transport):
         self._elsewhere = bool(settings.client and settings.connect)  # its hub and siblings are on other machines
         self._connecting = threading.RLock()  # held while subscribing, and while a connection is made
         self._subscribers: dict[Subscription, zenoh.Subscriber[None]] = {}
-        self._publishers = Publishers(lambda topic: self.policy.is_invented(topic))
+        self._publishers = Publishers(lambda topic: self.policy.is_invented(topic))  # set later, see TopicPolicy
         self._hub = HubConnection(client_id, will, self._own, self.count_received, settings.account)
         self._reset()
 
@@ -93,7 +93,7 @@ class ZenohTransport(Transport):
         except (zenoh.ZError, TransportError) as error:
             presence.release()
             raise TransportError(f"zenoh session of {self.client_id}: {error}") from None
-        if self._begin(session, presence.name):
+        if self._begin(session, presence.name):  # False: closed meanwhile
             presence.ready()
 
     def _start_client(self) -> bool:
@@ -147,7 +147,7 @@ class ZenohTransport(Transport):
     def _publish_will_and_leave(self, session: zenoh.Session, will: Message | None) -> None:
         try:
             if will is not None:
-                self._send(will, False)
+                self._send(will, False)  # not urgent
                 self._hub.leave(session)  # or else it would publish the will once more
             self._synchronize(GOODBYE_S)  # siblings and hub have received our last messages when they answer
         except zenoh.ZError as error:
@@ -168,7 +168,7 @@ class ZenohTransport(Transport):
             try:
                 linked = self._follow(view, version, linked)
             except Exception:  # any error must lead to a reconnect, never end the thread
-                if self._hub.watch.closed:
+                if self._hub.watch.closed:  # the transport is being closed, which may be why
                     return
                 log.exception("%s: unexpected failure of the connection to the hub", self.client_id)
                 linked = 0
@@ -223,7 +223,7 @@ class ZenohTransport(Transport):
             return False
         self._refresh()
         self._set_state(State.CONNECTED)
-        self._send_lacking(session, set())  # what became pending meanwhile
+        self._send_lacking(session, set())  # only what became pending meanwhile: the hub lacks nothing else
         return True
 
     def _send_hello(self, session: zenoh.Session) -> bool:
@@ -321,7 +321,7 @@ class ZenohTransport(Transport):
             self.count_received()
             read_at = clock.since_boot()
             stamp = wire.read_live(sample.attachment)
-            # A sender of the same boot shares the clock, so that also the time in the socket counts.
+            # A sender of the same boot shares our clock: its age counts from the sending. Most need no second look.
             since = stamp.sent_ns / 1e9 if stamp.boot == wire.BOOT else None
             if (since is None or read_at - since > late_s) and self._is_late(sample, stamp, read_at):
                 return
@@ -340,12 +340,12 @@ class ZenohTransport(Transport):
     def _is_late(self, sample: zenoh.Sample, stamp: wire.LiveStamp, now: float) -> bool:
         """True if ``sample`` waited in a socket while this process was stopped, longer than a connection's lease (T19).
 
-        Retained messages are never late, because they are not sent again; nor are stops, which must always take effect.
+        Retained messages are not sent again, and stops must take effect: they are never late, nor is what has no stamp.
         """
         topic = key_to_topic(str(sample.key_expr))
         if not stamp.boot or self.policy.is_stop(topic):
             return False
-        age_s = self._ages.age_s(stamp.boot, topic, stamp.sent_ns / 1e9, now)
+        age_s = self._ages.age_s(stamp.boot, topic, stamp.sent_ns / 1e9, now)  # and learn the sender's clock
         if stamp.retain_requested or age_s <= self._ages.late_s:
             return False
         self.counters.add("late")

@@ -123,13 +123,13 @@ def _without_uplink(notes: Notes, root: Root) -> Root:
 
 
 def _serial(reader: Reader, serial: SerialBridge, path: Path) -> SerialBridge:
-    if "instances" in path:
+    if "instances" in path:  # the section of an instance
         if serial.instances:
             reader.notes.problem((*path, "instances"), "must be left out: an instance has none")
         return serial
     lines = {(*path, "instances", name): line for name, line in serial.instances.items()}
     if serial.serial.port is not None or not any(line.enabled for line in lines.values()):
-        lines = {path: serial, **lines}  # else the section only holds what its instances share
+        lines = {path: serial, **lines}  # the section itself is a line, and not only what instances share
     ports: dict[str, str] = {}  # names of lines by their ports
     for place, line in lines.items():
         port = line.serial.port

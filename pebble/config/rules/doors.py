@@ -54,7 +54,7 @@ def _check_links(notes: Notes, root: Root) -> None:
         if not endpoint.startswith(ENCRYPTED):
             notes.problem(path, f'{endpoint} is not encrypted: write tls/… at security.level "{level}"')
     for path, section in connections(root):
-        leaves_machine = any(place[:-1] == path for place, _ in _endpoints(root))
+        leaves_machine = any(place[:-1] == path for place, _ in _endpoints(root))  # by an endpoint of this section
         if leaves_machine and getattr(section, "account", None) == "":
             why = f'is missing at security.level "{level}": `pebble fleet certificate NAME` prints what belongs there'
             notes.problem((*path, "account"), why)
@@ -79,7 +79,7 @@ def _is_near(endpoint: str) -> bool:
 
 
 def _check_sides(notes: Notes, root: Root) -> None:
-    """Refuse connections that bypass the bridge: at the level ``named`` only the bridge checks the names."""
+    """Refuse connections that bypass the bridge, which alone checks the names of senders at the level ``named``."""
     bridge, transport = root.services.mqtt_bridge, root.transport
     why = 'at security.level "named" the bridge checks names'
     if not bridge.enabled:
@@ -87,10 +87,10 @@ def _check_sides(notes: Notes, root: Root) -> None:
     for path, _ in renamed_commands(root):
         notes.problem(path, f"cannot be renamed: {why}, by the contract's topics")
     for path, mqtt in _robots_brokers(root):
-        if path[-1] != "remote_mqtt" and not is_loopback(mqtt.host):
+        if path[-1] != "remote_mqtt" and not is_loopback(mqtt.host):  # of the robot's own programs
             notes.problem((*path, "host"), f"must be on loopback: {why}, which are not checked at {mqtt.host}")
     for path, endpoint in _endpoints(root):
-        if path[0] == "transport":
+        if path[0] == "transport":  # between the robot's own programs
             notes.problem(path, f"{endpoint}: must be on loopback: {why}, which are not checked there")
     remote, local = bridge.remote_mqtt, root.local_mqtt
     if bridge.enabled and transport.kind == "mqtt" and bridge.remote is None and place_of(remote) == place_of(local):

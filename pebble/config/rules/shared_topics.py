@@ -41,7 +41,7 @@ def renamed_commands(root: Root) -> Iterator[tuple[Path, str]]:
 def _keys(channel: Channel, root: Root) -> Iterator[tuple[Path, str | None]]:
     """Yield each key that may rename the channel, with its topic (None: not set); serial lines have a key each."""
     if channel.override is None:
-        yield (), None
+        yield (), None  # no key renames it
         return
     keys = tuple(channel.override.split("."))
     if keys[:2] != _SERIAL:

@@ -1,7 +1,6 @@
 """Calibrates a camera by pictures of one tag, held in all parts of the picture, near and far."""
 
 from collections.abc import Iterable, Iterator
-from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,7 +41,12 @@ def view_of(tag: Tag, size: tuple[int, int]) -> View | None:
         return None
     x, y = tag.corners.mean(axis=0)
     near, between, far = _DISTANCES
-    distance = near if share >= _NEAR else between if share >= _MIDDLE else far
+    if share >= _NEAR:
+        distance = near
+    elif share >= _MIDDLE:
+        distance = between
+    else:
+        distance = far
     return _ROWS[int(3 * y / height)], _COLUMNS[int(3 * x / width)], distance
 
 
@@ -63,12 +67,13 @@ def collect(
             before = None
             continue
         rests = before is not None and float(np.abs(tag.corners - before).max()) < _STILL_PX
-        resting, before = resting + 1 if rests else 0, tag.corners
+        resting = resting + 1 if rests else 0
+        before = tag.corners
         view = view_of(tag, size) if still or resting >= _STILL_PICTURES else None
         if view is None or view in by_view:
             continue
         by_view[view] = tag.corners
-        seen = {*chain(*by_view)}
+        seen = {word for known_view in by_view for word in known_view}
         missing = [name for name in (*_ROWS, *_COLUMNS, *_DISTANCES) if name not in seen]
         person.tell(
             f"{len(by_view)} of {LEAST_PICTURES}: {' '.join(view)}; next: {', '.join(missing) or 'another place'}"

@@ -60,6 +60,7 @@ def cameras(config: Config, folder: Path = Path("/dev")) -> Iterator[CheckResult
 
 
 def camera(backend: str, name: str, folder: Path) -> CheckResult:
+    """Check the camera that the config calls ``name``. ``folder``: where device files are."""
     if backend == "synthetic":
         return ok("synthetic: needs no device")
     if backend != "v4l2":
@@ -88,7 +89,7 @@ def loudspeaker(config: Config) -> Iterator[CheckResult]:
     commands = []
     if sounds.enabled:
         commands.append(sounds.playback.player_command)
-    if devices.enabled and devices.audio.enabled:
+    if devices.enabled and devices.audio.enabled:  # as for the program that plays voices, see loudspeaker_programs
         commands.append(config.section(Media).audio_receiver.command)
     for name in dict.fromkeys(command[0] for command in commands):
         if shutil.which(name) is not None:

@@ -42,7 +42,7 @@ def synchronised() -> bool | None:
 
 
 def output_of(program: str, *arguments: str, seconds: float = 5.0, **user: Any) -> str:
-    """Return a system program's standard output, run as ``user``. Raises PebbleError."""
+    """Return a system program's standard output, run as ``user``. Raises PebbleError if it fails without output."""
     command: tuple[str, ...] = (program, *arguments)
     try:
         done = run(command, seconds, cwd="/", **user)

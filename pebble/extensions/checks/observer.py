@@ -48,7 +48,7 @@ class Observer:
         self.listeners: list[Callable[[Message, float], None]] = []  # get each message, and when it arrived (monotonic)
         #: Returns each change of the wheels' speeds as seen from outside: when (monotonic), and left and right.
         self.eyes: Callable[[], list[tuple[float, list[float]]]] = list  # nothing is seen from outside
-        self._of: defaultdict[c.Channel | None, deque[Record]] = defaultdict(lambda: deque(maxlen=_MOST))
+        self._of: defaultdict[c.Channel | None, deque[Record]] = defaultdict(lambda: deque(maxlen=_MOST))  # by channel
         self._slowest_s = ANSWER_S / 4  # of its answers so far, at least this; :attr:`patience_s` follows from it
         self._arrived: deque[tuple[Message, float, float]] = deque(maxlen=_MOST)  # with the times, monotonic and epoch
         # If the robot checks names, its commands have this client's account in their topics.
@@ -151,7 +151,7 @@ class Observer:
 
     @contextmanager
     def beside(self, program: str, *filters: str) -> Iterator[tuple[Transport, deque[Message]]]:
-        """Yield a second connection that reads ``filters``.
+        """Yield a second connection that reads ``filters``, and its messages. ``program``: as in :class:`Target`.
 
         Each filter is a subscription of its own, as some brokers refuse one of them.
         """

@@ -40,7 +40,7 @@ class CheckedNames(Names):
         self._below = f"{base}/{INCOMING}/{BY}/"
         self._subjects = subjects
         rights = () if strangers == "refuse" else (Right.LOOK, Right.DRIVE)
-        self._strangers = frozenset(
+        self._strangers = frozenset(  # channels that senders without an account may write
             channel.suffix for right in rights for channel in WRITES[right] if isinstance(channel, Channel)
         )
 
@@ -81,7 +81,7 @@ class CheckedNames(Names):
             return Drop.UNREADABLE
         fields, by = _object(payload), account  # by: the checked sender, in place of a claim
         if fields is not None:
-            body = _body(fields)
+            body = _body(fields)  # the same object, or its ``value``
             claim = body.get("by")
             if account != NO_ACCOUNT and isinstance(claim, str) and claim:
                 by = _with_person(account, claim[:_LONGEST])

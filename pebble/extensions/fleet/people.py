@@ -254,14 +254,15 @@ def has_user(path: Path | None, name: str = "") -> bool:
 
 
 def _has_user(path: Path, name: str) -> bool:
-    # Writes nothing: ``immutable`` keeps SQLite from making its shared-memory file. Beside a write-ahead log, which has
-    # to be read, that file is there already.
+    """True if the file has this person; with the name "", if it has any person."""
+    # Nothing is written: ``immutable`` keeps SQLite from making its shared-memory file. Beside a write-ahead log, which
+    # has to be read, that file is there already.
     unchanged = "" if path.with_name(f"{path.name}-wal").exists() else "&immutable=1"
     try:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro{unchanged}", uri=True)) as connection:
             if not connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'people'").fetchall():
                 return False  # the program that made it was killed
-            any_or_this = "SELECT 1 FROM people WHERE ? IN (name, '')"  # without a name: any person
+            any_or_this = "SELECT 1 FROM people WHERE ? IN (name, '')"  # "": any person
             return bool(connection.execute(any_or_this, (name,)).fetchall())
     except sqlite3.Error as error:
         raise DatabaseError(path, error) from None
@@ -282,7 +283,7 @@ def _spellings(password: str) -> set[str]:
 
 @cache
 def _no_hash() -> bytes:
-    return _hash("", b"no such person..")
+    return _hash("", b"no such person..")  # with the salt that :meth:`People.check` takes for an unknown name
 
 
 def _hash(password: str, salt: bytes) -> bytes:

@@ -104,12 +104,12 @@ class Audit(Observer):
                     self.passed(member.channel, by, member.payload)
         row_of = _COMMANDS.get(channel.suffix)
         if row_of is None and channel.kind not in (Kind.FLAG, Kind.ACTION):
-            return
+            return  # a group, too: only its members have rows
         with suppress(PayloadError):
             if row_of is not None:
                 command = codec.decode(channel, payload)
                 row, who = row_of(command), _sender(by, command)
-                most_different = OF_STRANGERS if channel in _MILD else DIFFERENT  # in a minute
+                most_different = OF_STRANGERS if channel in _MILD else DIFFERENT  # in a minute, see RowWriter.add
                 if row and not self._noted_before(row, who):
                     self.note(who=who, most=most_different, **_place(by), **row)
                 if channel is ESTOP_RESET:

@@ -279,7 +279,7 @@ def _of_expander() -> Iterator[Rule]:
     for channel in c.CHANNELS:
         if channel.kind is Kind.STREAM and channel.remote and channel.bridged and channel is not c.STREAMS:
             yield Rule("write", channel.filter(_ANY))
-    # How groups are written, the groups, and announcements of expanders, also those with a name: only one may work.
+    # How groups are written, the groups, and announcements with and without a name, by which only one expander works.
     for suffix in (c.WIRE.suffix, c.STREAMS.suffix, c.EXPANDER.suffix, f"{INCOMING}/{BY}/+/{c.EXPANDER.metric}"):
         yield Rule("read", f"{_ANY}/{suffix}")
     yield Rule("read", f"{c.SHORT}+")  # the short topics of groups
@@ -301,7 +301,7 @@ def _of_rights(
                 yield Rule("write", f"{_ANY}/{INCOMING}/{BY}/{name}/{metric}")
             for base in bases_without_names:
                 yield Rule("write", f"{base}/{INCOMING}/{metric}")
-    if Right.DRIVE in held:  # `pebble doctor` checks a page server's account by probes, which programs ignore
+    if Right.DRIVE in held:  # as a page server, whose account `pebble doctor` checks by probes, which programs ignore
         yield Rule("write", c.BRIDGE_PROBE.filter(f"+/{SERVERS}/+"))
     if Right.EXPAND in held:
         yield from _of_expander()

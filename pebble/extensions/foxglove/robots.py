@@ -76,7 +76,8 @@ class Robots:
         if channel is CAPABILITIES:
             for medium in _MEDIA:
                 feed = self._feed(robot, medium)
-                self._by_channel.update(dict.fromkeys(feed.update(), feed))
+                new_channels = feed.update()
+                self._by_channel.update(dict.fromkeys(new_channels, feed))
         at_ns = time.time_ns() - round((time.monotonic() - at) * 1e9)
         self._publish(channel, message, at_ns)
         if channel is AUTONOMY_STATUS:  # also as a sentence for people: that the robot drives by itself
@@ -126,6 +127,7 @@ class Robots:
     # -- pictures and sound
 
     def _feed(self, robot: RobotView, medium: Medium) -> MediaFeed:
+        """Return the feed of this medium, which is made and started at the first call."""
         if (feed := self._feeds.get((robot.base, medium))) is not None:
             return feed
         feed = self._feeds[robot.base, medium] = MediaFeed(self._broker, self._server, self._schemas, robot, medium)

@@ -211,7 +211,7 @@ class JitterBuffer:
             self.counters.add("jumps")
         elif missing:
             self.counters.add("lost", missing)
-        elif self._concealed and self._last is not None:  # the packet came late: estimated sound took its time
+        elif self._concealed and self._last is not None:  # the packet came late, after estimated sound in its place
             self._depth.late(self._concealed / self._last.rate, now)
         return self._play(number, now)
 
@@ -289,7 +289,7 @@ def _faded_in(samples: Samples, rate: int) -> Samples:
 def _faded_over(old: ReceivedSound, new: ReceivedSound) -> ReceivedSound:
     """Return ``new``, with its beginning faded over from ``old``."""
     size = min(len(old.samples), len(new.samples), round(_FADE_S * new.rate))
-    if (old.rate, old.channels) != (new.rate, new.channels) or old is new:
+    if (old.rate, old.channels) != (new.rate, new.channels) or old is new:  # the same: nothing was skipped
         return new
     weight = np.linspace(0.0, 1.0, size)[:, None]
     samples = new.samples.copy()

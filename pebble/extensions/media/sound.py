@@ -62,7 +62,7 @@ class _Intake:
 class SoundEncoder:
     """An encoder that takes any amount of s16le and returns whole packets; the remaining samples wait for more.
 
-    A packet holds ``bundle`` Opus packets, or the samples unchanged if there is no ``codec``.
+    A packet holds ``bundle`` Opus packets, or the samples unchanged if there is no ``codec``. ``numbers``: of packets.
     """
 
     def __init__(

@@ -131,7 +131,7 @@ class Control:
         if "drive" in self._rights():
             server.drivers.restore(hello.token, self._tab)
         server.robots.join(self._interest)
-        self._interest.dirty |= {(ref, "web/driver") for ref in server.robots.components}  # join() leaves them out
+        self._interest.dirty |= {(ref, "web/driver") for ref in server.robots.components}  # in no table, see _flush
         self._post(self._ping())
 
     def _end(self) -> None:
@@ -264,7 +264,7 @@ class Control:
         if not self._may("reset", op) or robot is None:
             return
         reset = Reset(robot.estop, self._session.user)
-        known, reset.shown = reset.shown, {}
+        known, reset.shown = reset.shown, {}  # refilled with the stops that the page has shown
         for shown in op.owners:
             if shown.owner in known:
                 reset.shown[shown.owner] = replace(known[shown.owner], boot=shown.boot, count=shown.count)
@@ -315,8 +315,9 @@ class Control:
         def granted() -> None:
             self._audit("take over" if op.over else "take", op.ref)
 
-        is_held = driven.published is not None and driven.published.id != ""
-        if is_held and not op.over:
+        state = driven.published  # of control, by the robot itself
+        is_held = state is not None and state.id != ""
+        if is_held and not op.over:  # the holder may go on: so the request is noted as well as its success
             self._audit("ask", op.ref)
         server.drivers.take(self._tab, robot, granted, lambda why: self._refuse(op, why), over=op.over)
 

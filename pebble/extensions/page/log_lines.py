@@ -127,7 +127,7 @@ def _line(plain: Any) -> Line:
         record = record | record["value"]  # {"t": …, "value": {"message": …}}
     text = next((record[name] for name in ("message", "msg", "value") if name in record), record)
     service = _word(record.get("service"))
-    message = _text(text).removeprefix(f"[{service}] " if service else "")  # it is shown beside it
+    message = _text(text).removeprefix(f"[{service}] " if service else "")  # pages show the service apart
     level = _word(record.get("level")).upper()
     return Line(message, _stamp(record), _SYNONYMS.get(level, level), service)
 

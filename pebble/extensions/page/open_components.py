@@ -61,14 +61,14 @@ class OpenComponents:
         keep_s: float = KEEP_S,
         step_s: float = STEP_S,
     ) -> None:
-        """Store the arguments. ``spawn`` runs a coroutine in the background."""
+        """Store the arguments. ``spawn`` runs a coroutine in the background; for the times see KEEP_S and STEP_S."""
         self._broker, self._robots, self._spawn = broker, robots, spawn
         self._keep_s, self._step_s = keep_s, step_s
-        self._pages: Counter[str] = Counter()  # that have each component open
+        self._pages: Counter[str] = Counter()  # by component: how many have it open
         self._subscriptions: dict[str, dict[str, Subscription]] = {}  # by component and filter
         self._following: set[str] = set()  # components whose task, _follow, runs
-        self._wanted: dict[str, _Filters] = {}  # by component
-        self._flags: dict[str, FlagsView] = {}
+        self._wanted: dict[str, _Filters] = {}  # by component: what its task, _follow, subscribes to
+        self._flags: dict[str, FlagsView] = {}  # by component: its flags as pages see them
 
     @property
     def known(self) -> set[str]:

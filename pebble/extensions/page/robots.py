@@ -137,10 +137,11 @@ class Robots:
     def take(
         self, interest: Interest, now: float, *, large: bool
     ) -> tuple[tuple[tuple[str, str, Any, float], ...], bool]:
-        """Return the values that this page still needs (None: removed), and whether a large one is among them.
+        """Return the values that this page still needs, and whether a large one is among them.
 
-        They count as sent from now on. The component that the page has open comes first. At most one large value is
-        taken, and only with ``large``. The others, and what does not fit into this message, wait for the next.
+        Each: component, metric, value (None: removed), age in milliseconds. They count as sent from now on. The
+        component that the page has open comes first. At most one large value is taken, and only with ``large``. The
+        others, and what does not fit into this message, wait for the next.
         """
         dirty, interest.dirty = interest.dirty, set()
         taken: list[tuple[str, str, Any, float]] = []
@@ -249,7 +250,8 @@ class Robots:
         """Send values that change with time. Call this every 0.25 s.
 
         Whether a component is online is sent at once. Ages are sent each second for open components. The others take
-        turns, at most a third of them at once and _REFRESHES_PER_S a second, so that a thousand robots cause no flood.
+        turns, each every ``turn_s``: so they are _REFRESHES_PER_S a second, and a thousand robots cause no flood. At
+        most a third of these are sent in one call.
         """
         due: list[Component] = []
         opened = {interest.watched for interest in self.interests}
@@ -291,10 +293,10 @@ class Robots:
 
     def _has_room(self, component: Component, metric: str, channel: c.Channel, more_bytes: int) -> bool:
         """True if a value may be stored. States of motor owners always may, as stop and control depend on them."""
-        if component.lists(metric):  # it is such a state
+        if component.lists(metric):  # it is the state of a motor owner
             return True
-        is_new = metric not in component.values  # of channels that are no patterns there are few
-        if is_new and len(component.values) >= MAX_METRICS and channel.is_pattern:
+        is_new = metric not in component.values
+        if is_new and len(component.values) >= MAX_METRICS and channel.is_pattern:  # the other channels are few
             return False
         return self._bytes + more_bytes <= MAX_BYTES or self.is_kept(component.ref)
 
@@ -367,7 +369,7 @@ class Robots:
                 interest.notify()
 
     def _mark(self, ref: str, metric: str, *, everybody: bool = False) -> None:
-        """Note that pages need a value: all if ``everybody``, or if all show the metric; else those showing ``ref``."""
+        """Note that pages need a value: all if ``everybody`` or it is of FLEET; else those that show ``ref``."""
         channel = _channel(metric)
         everybody = everybody or channel in FLEET
         for interest in self.interests:

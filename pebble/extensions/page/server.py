@@ -99,7 +99,7 @@ class Server:
     async def close(self) -> None:
         """Stop the motion that pages cause, then disconnect."""
         try:
-            self.drivers.closed_all()
+            self.drivers.closed_all()  # as if all pages had closed
             for task in list(self._tasks):
                 task.cancel()
             await asyncio.gather(*self._tasks, return_exceptions=True)

@@ -37,7 +37,7 @@ _SHEETS = {"fleet.html": "fleet.css"}  # that the screen needs beside app.css
 _IMPORT = re.compile(rb'^(?:import|export|\}).*?"(\.\.?/[^"]+)";?$', re.MULTILINE)
 _AGAIN = re.compile(r"\.\d{1,4}")  # after the version: the same files once more, for a page that has lost one
 _COMMENTS = re.compile(r"^[ \t]*(?:/\*.*?\*/|//[^\n]*)[ \t]*$", re.MULTILINE | re.DOTALL)
-_CASTS = re.compile(r"/\*\* @[^\n]*?\*/ ")  # types within a line
+_CASTS = re.compile(r"/\*\* @[^\n]*?\*/ ")  # comments with types, within a line
 _LINE_ENDS = re.compile(r"(?<=\S)[ \t]+//[ ][^\"'`\n]*$", re.MULTILINE)  # one with quotes may be the end of a string
 _LOOSE = re.compile(r" (?=\{$)|(^[\w-]+:) |;\n(?=})|(?<=[{};,])\n|(?<=,) ", re.MULTILINE)  # needless in style sheets
 _INDENTATION = re.compile(r"^\s+", re.MULTILINE)
@@ -149,7 +149,10 @@ def _read(folder: Traversable, path: str) -> Iterator[tuple[str, bytes]]:
 
 
 def stripped(source: bytes, suffix: str) -> bytes:
-    """Return a file without indentation, comments and empty lines, which makes it a sixth smaller."""
+    """Return a file without comments, indentation and empty lines, which makes it a sixth smaller.
+
+    In style sheets other needless blanks are removed as well.
+    """
     text = source.decode()
     if suffix in ("css", "js", "mjs"):
         text = _COMMENTS.sub("", text)

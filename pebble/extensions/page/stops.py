@@ -52,7 +52,7 @@ class Stops:
 
         It is asked once in each ``tick``.
         """
-        self._may_repeat, self._repeats = may_repeat, True
+        self._may_repeat, self._repeats = may_repeat, True  # its answer in the newest tick
         self.changed: set[str] = set()  # robots whose view may be another one now
         self._stops: dict[str, _PressedStop] = {}  # by name, the newest last
         self._by_ref: dict[str, _PressedStop] = {}  # the same stops by robot; "": the one of all
@@ -154,7 +154,7 @@ class Stops:
         for stop in list(self._stops.values()):
             if not stop.is_over:
                 messages += stop.sender.tick(now, again=self._repeats)
-                if stop.sender.finished:  # other progress was noted when the robot's message came
+                if stop.sender.finished:  # perhaps by time alone; `receive` notes what robots' messages show
                     stop.is_over = True
                     for ref in stop.sender.robots:
                         self._note_progress(stop, ref)

@@ -87,7 +87,7 @@ def _messages(path: Path, since_ns: int, until_ns: int, chooses: Chooses, damage
     with RecordingFile(present) as file:
         damages[present] = file.damage
         for message in file.read(chooses=chooses, since_ns=since_ns, until_ns=until_ns):
-            if since_ns <= message.log_ns < until_ns:
+            if since_ns <= message.log_ns < until_ns:  # `read` leaves out only whole chunks
                 yield message
 
 

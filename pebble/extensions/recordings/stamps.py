@@ -40,7 +40,7 @@ def stamp_ns(payload: bytes) -> int:
             stamps = _stamped.decode(payload)
         except (ValueError, RecursionError):  # msgspec's are ValueErrors
             return 0
-        return _in_ns(stamps.timestamp if stamps.t is None else stamps.t)  # its size tells its unit
+        return _in_ns(stamps.timestamp if stamps.t is None else stamps.t)  # seconds or milliseconds: the number tells
     header = _media_header(payload[:_MEDIA_HEAD]) if first == b"P" else None
     return 0 if header is None else _in_ns(header.captured_ms, 10**6)
 

@@ -109,7 +109,7 @@ class GroupGate:
             return Drop.REFUSED
         parts = [self._part(source, message, member, account) for member in members]
         drops = [part.way for part in parts if isinstance(part.way, Drop)]
-        outcome: Forward | Drop = drops[0] if drops else forward
+        outcome: Forward | Drop = drops[0] if drops else forward  # one refused member refuses the group
         if isinstance(outcome, Forward):
             # the checks may have changed the payloads
             parts = [part._replace(member=replace(part.member, payload=part.message.payload)) for part in parts]
@@ -119,7 +119,7 @@ class GroupGate:
         else:
             deliveries = [(part, part.message.payload) for part in parts if part.member.channel.ends(part.member.value)]
         for part, payload in deliveries:
-            if isinstance(part.way, Drop):
+            if isinstance(part.way, Drop):  # what ends something may be refused, too
                 continue
             self._forwarder.deliver(source, part.subject, replace(part.message, payload=payload), part.way)
             if part.member.channel is DRIVE:

@@ -94,7 +94,7 @@ class LinkMeter:
         thin = profile == "thin" or (profile == "auto" and kbit is not None and kbit < _LITTLE_KBIT)
         self.level: LinkLevel = "thin" if thin else "wide"
         self.queue_s = 0.0
-        self._fixed = thin or profile != "auto"
+        self._fixed = thin or profile != "auto"  # the level never changes
         self._answer_number, self._answered_at = 0, -inf  # of the newest answer, and when an answer last counted
         self._shortest = ShortestTrip()
         self._newest: deque[float] = deque(maxlen=3)  # queues that were measured at this level
@@ -181,7 +181,7 @@ class Room:
 
     def __init__(self, kbit: float | None = None) -> None:
         self._rate = None if kbit is None else _CARRIED * kbit * 125  # bytes/s
-        self._bytes = float(_FIRST_BYTES if self._rate is None else _LEAST_BYTES)
+        self._bytes = float(_FIRST_BYTES if self._rate is None else _LEAST_BYTES)  # that may be on their way
         self._in_flight = InFlight(_SLACK_BYTES, _MOST)
         self._waiting = 0  # bytes that are not confirmed
         self._was_full = False  # since the last poll a message found no room
@@ -192,7 +192,7 @@ class Room:
         confirmed = self._in_flight.acknowledge(waiting)
         if self._rate is not None:
             self._bytes = max(_LEAST_BYTES, self._rate * (round_trip_s + _SOON_S))
-        elif any(now - sent.at - round_trip_s > _SOON_S + _POLL_S for sent in confirmed):
+        elif any(now - sent.at - round_trip_s > _SOON_S + _POLL_S for sent in confirmed):  # one was delayed
             self._bytes = max(_LEAST_BYTES, 0.7 * self._bytes)
         elif self._was_full:  # otherwise there was no need for more
             self._bytes = min(_MOST_BYTES, self._bytes + sum(sent.size for sent in confirmed))

@@ -54,14 +54,17 @@ class Sieve:
         self._waiting: dict[str, Waiting] = {}  # by topic, in the order in which they began to wait
         self._sent_at: dict[str, float] = {}  # by the topic of a stream, the oldest first
         self._ranks_that_wait: set[Rank] = set()  # those with a message that found no room
-        self._event_waits_since = inf  # since when an event waits in its side's buffer, refused here; inf: none
-        self._event_was_refused = False  # by `takes_event`, since ``due`` was last called for states
+        self._event_waits_since = inf  # when `takes_event` first refused the event that waits; inf: none waits
+        self._event_was_refused = False  # `takes_event` has refused one since the last call of ``due(Rank.STATE)``
 
     def __len__(self) -> int:
         return len(self._waiting)
 
     def takes_event(self, message: Message) -> bool:
-        """Return True if an event may be sent now. False: it stays in its buffer, and its waiting time is noted."""
+        """Return True if an event may be sent now, with as much room as a state may use.
+
+        False: it stays in its buffer, and its waiting time is noted.
+        """
         goes_before_states = self._event_is_overdue or Rank.STATE not in self._ranks_that_wait
         if goes_before_states and self._takes(Rank.STATE, _size(message)):
             self._event_waits_since = inf

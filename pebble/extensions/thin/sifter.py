@@ -20,7 +20,7 @@ from pebble.transports import Message
 
 
 class Sifter:
-    """The sieve of a forwarder, for messages that leave the robot; thread-safe."""
+    """A switch for messages that leave the robot: to the sieve, a group of streams, or the forwarder; thread-safe."""
 
     def __init__(self, forwarder: Forwarder, way: Forwarder | GroupGate, groups: StreamGroups | None) -> None:
         """Store the arguments; ``way``: the part that forwards messages, the forwarder itself or a gate before it."""

@@ -165,8 +165,9 @@ class ThinUplink(Uplink):
         return self.level.heartbeat_qos if self._saves_acks else None
 
     def heartbeat_due(self) -> bool:
-        now, level_s = self._clock(), self.level.heartbeat_s  # 0: the level sets no period
+        now, level_s = self._clock(), self.level.heartbeat_s  # 0: the level sets no period, only the bridge's timer
         if level_s:
+            # This is called every POLL_S: of all calls, the one nearest to the due time counts.
             if now - self._heartbeat_at < max(level_s, self._heartbeat_s) - POLL_S / 2:
                 return False
             if not self._takes(Rank.HEARTBEAT, _HEARTBEAT_BYTES):
@@ -178,6 +179,7 @@ class ThinUplink(Uplink):
         return seconds * _PAUSE if self._meter.level == "thin" else seconds
 
     def poll(self) -> bool:
+        """Measure the link, and send what has room now; return True to have :meth:`heartbeat_due` asked, too."""
         now = self._clock()
         outgoing = self._remote.outgoing
         with self._guard:

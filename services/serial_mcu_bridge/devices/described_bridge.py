@@ -84,10 +84,11 @@ class DescribedBridge(SerialService):
         self._conflict_logged = False  # another device has the same uid
         self.device: Device | None = None
         self._published_states: dict[int, tuple[Reading, int]] = {}  # newest of each state interface, its epoch ms
-        self._generic: list[Subscription] = []  # of the device that was described last, connected or not
+        #: To the generic topics, mcu/…, of the device that was described last, connected or not.
+        self._generic: list[Subscription] = []
         self.aliases = AliasUse(self.log, self._peers, self._begin_alias, self._end_alias, self.options.aliases)
-        self._features = _ProvidedFeatures(Notifier())
-        self._timer: Timer | None = None
+        self._features = _ProvidedFeatures(Notifier())  # such as outlets, for the robot's capabilities
+        self._timer: Timer | None = None  # for the next event of the session, or of the peers
 
     def start(self) -> None:
         self.post(self._subscribe)
@@ -131,7 +132,7 @@ class DescribedBridge(SerialService):
         self._arm()
 
     def _arm(self) -> None:
-        """Set the timer if the next event is earlier; a timer that is too early does no harm."""
+        """Set the timer, unless it is set for the next event or earlier: a timer that is too early does no harm."""
         times = [due for due in (self._session.due, self._peers.due) if due is not None]
         due = min(times, default=None)
         if due is None or (self._timer is not None and self._timer.due <= due):
@@ -166,7 +167,7 @@ class DescribedBridge(SerialService):
         device, now_ms = self.device, _now_ms()
         is_motion = reading.interface.profile == MOTION
         has_motion = device is not None and device.has_motion
-        if is_motion or not has_motion:  # others go on if the inertial sensor fails
+        if is_motion or not has_motion:  # other readings do not show that the inertial sensor works
             self.watchdog.sample(self.clock())
         if is_motion:
             self.sensors.take(measured(reading.values), self.clock())
@@ -212,6 +213,7 @@ class DescribedBridge(SerialService):
             self.log.warning(text, uid)
 
     def _publish_device(self, manifest: Manifest) -> None:
+        """Receive the commands of a device that has described itself, and publish what it is."""
         device = self.device = Device(manifest, self.addresses, ImuReports(self.options, self.instance))
         hello = device.hello
         self.log.info("%s: %r, firmware %r, %d interfaces", device.uid, hello.model, hello.firmware_version,
@@ -227,8 +229,8 @@ class DescribedBridge(SerialService):
         self._listen_generic(device, private=False)  # a reader of the manifest may send commands at once
         self.publish(MCU_LOCAL_ONLY, device.local_only, uid=device.uid)
         self.publish(MCU_DESCRIBE, device.payload, uid=device.uid)
-        self.publish(MCU_COMMAND, {"from": self._token}, uid=device.uid, name=RESERVED)  # a _UID_QUERY, with a token
-        self._listen_generic(device, private=True)  # only now, as bridges have been told that these stay here
+        self.publish(MCU_COMMAND, {"from": self._token}, uid=device.uid, name=RESERVED)  # _UID_QUERY: who else has it?
+        self._listen_generic(device, private=True)  # after the list by which bridges keep these on the robot
         self.aliases.announce(device)
         self.call_at(self.clock() + CLAIM_S, partial(self.aliases.permit, device))
 
@@ -305,6 +307,7 @@ class DescribedBridge(SerialService):
         self.log_limited.warning("command", "refused a command: %s", why)
 
     def _begin_alias(self, device: Device, route: Route, alias: Alias) -> Subscription | None:
+        """Return the subscription to an alias for commands; on any other alias publish the newest state."""
         self._features.names |= outlet_feature(alias.claim)
         if route.interface.direction is Direction.IN:
             return self.listen(alias.channel, partial(self._command, device, route))
@@ -329,7 +332,7 @@ class DescribedBridge(SerialService):
             self.transport.subscribe(self.addresses[GROUP].topic, receive, qos=QoS.DELIVERED, direct=True)
 
     def _on_manifest(self, message: Message) -> None:
-        """Handle the manifest of any device, on the transport's thread."""
+        """Handle the manifest of any device, on the transport's thread. A wrong one is left out."""
         uid = MCU_DESCRIBE.names(message.topic).get("uid")
         if uid is None:  # the filter's + also matches an empty level
             self.counters.add("refused")

@@ -67,5 +67,5 @@ class ImuBridge(SerialService):
                 if summary is not None:
                     self.publish(IMU, summary)
             case DeviceLogLine(level, text):
-                subject = "malformed" if level == logging.WARNING else "log"
+                subject = "malformed" if level == logging.WARNING else "log"  # `parse` warns of nothing else
                 self.device_log.log(subject, level, "MCU: %s", text)

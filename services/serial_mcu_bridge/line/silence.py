@@ -15,8 +15,8 @@ class Silence:
     """
 
     def __init__(self) -> None:
-        self._opened = 0  # at the last check, as the next
-        self._received = 0
+        self._opened = 0  # how often the line was opened, at the last check
+        self._received = 0  # how many messages had come, at the last check
         self._received_at: float | None = None
         self._counted_at = 0.0
         self._unasked = 0  # checks in a row in which data had come unasked

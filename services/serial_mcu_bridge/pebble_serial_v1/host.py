@@ -120,12 +120,12 @@ class Session:
         self.mcu_ms: int | None = None  # what its clock showed when it sent something of its own accord
         self._base = base
         self._splitter = LineSplitter(FRAME_LIMIT, END)
-        self._too_long = 0
+        self._too_long = 0  # frames that were too long, as far as they were reported
         self._by_id: dict[int, Interface] = {}
         self.known: OrderedDict[Hello, Manifest] = OrderedDict()
         self._commands: OrderedDict[int, _Command] = OrderedDict()  # without an answer yet; the first is due first
         self._slots: dict[str, int] = {}  # by interface, or "group": the newest command's slot, below WAITING
-        self._sequence = 0
+        self._sequence = 0  # the number of our newest frame
         self._ask_at: float | None = None  # when to ask for the manifest; None: it is known, or there is no line
         self._received_at = self._pinged_at = self._asked_at = float("-inf")
 
@@ -192,7 +192,7 @@ class Session:
             if len(self._commands) > _OPEN_COMMANDS:
                 self._commands.popitem(last=False)
         kind = str(wanted[0][0].id) if len(wanted) == 1 else "group"
-        # a newer line replaces one of the same kind: so commands take turns in kinds, and WAITING of them can wait
+        # A line replaces a waiting one of its kind. With WAITING kinds, used in turn, as many commands can wait.
         slot = self._slots[kind] = (self._slots.get(kind, 0) + 1) % WAITING
         return Send(f"command {kind}/{slot}", data)
 
@@ -257,6 +257,7 @@ class Session:
         yield described
 
     def _reading(self, frame: Frame, now: float) -> Iterator[Event]:
+        """Yield the values in a frame. If they do not fit the manifest, ask for it again: it may be another by now."""
         if self.manifest is None:
             yield RefusedInput("early", "a reading before the manifest", logging.DEBUG)
             return

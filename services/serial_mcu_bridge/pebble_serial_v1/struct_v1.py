@@ -93,6 +93,7 @@ def _layout(types: tuple[FieldType, ...]) -> struct.Struct:
 
 
 def _value(field: Field, raw: Any) -> Any:
+    """Return a field's value for JSON: the packed number, scaled and rounded, so that 3 × 0.1 is 0.3."""
     if field.type is FieldType.BOOL:
         return raw
     if field.type is FieldType.F32:
@@ -105,6 +106,7 @@ def _value(field: Field, raw: Any) -> Any:
 
 
 def _raw(field: Field, values: Mapping[str, Any]) -> Any:
+    """Return the number to pack for a field. Raises PayloadError."""
     if field.name not in values:
         raise PayloadError(f"{field.name} is missing")
     value = values[field.name]

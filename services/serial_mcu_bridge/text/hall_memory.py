@@ -59,7 +59,7 @@ class HallMemory:
             os.close(descriptor)
 
     def _keep(self) -> None:
-        """Open the memory if it is not open, or its file is gone: a reader by SharedMemory removes it when it ends."""
+        """Open the memory if it is not open, or its file is gone: readers by SharedMemory remove it when they end."""
         if self._opened is not None and self._in_place(self._opened[0]):
             return
         self.close()

@@ -59,7 +59,7 @@ class MotorBridge(MotorOwner, SerialService):
         super().__init__(*arguments, **options)
         self._publishes_touch = self.options.telemetry.publish_touch_sensors
         self._power, self._again_at = (0.0, 0.0), 0.0  # (left, right) as published last, and when it is due again
-        self._charging: ChargingStatus | None = None
+        self._charging: ChargingStatus | None = None  # as published last: it is published only when it changes
         memory = self.config.hall_memory(self.options)
         self._hall = None if memory is None else HallMemory(memory)
         self._splitter = LineSplitter()

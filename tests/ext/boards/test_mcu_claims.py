@@ -69,6 +69,8 @@ def test_which_channels_a_device_gets() -> None:
     assert both == {"outgoing/lamp/one": "a", "incoming/lamp/one": "b"}, "outside the contract it is free"
     twice = claims(published(M("u", (state("a", "lamp"), state("b", "lamp", 2)))))
     assert (twice.granted, twice.refused) == ({"outgoing/lamp": "a"}, {"b": "outgoing/lamp: a has it already"})
+    nameless = msgspec.structs.replace(published(STATION), interfaces=[{"channel": ""}, {"channel": 5}])
+    assert claims(nameless).granted == {}
 
 
 COMMANDS = [
@@ -85,14 +87,16 @@ def test_which_channels_are_refused_with_which_reason() -> None:
     reasons = [refused(command("a", one)) for one in COMMANDS] + [refused(state("a", one)) for one in PUBLISHED]
     renamed = claims(published(M("u", (command("a", "elsewhere"),))), {"incoming/elsewhere": DRIVE}.get)
     assert [reason for reason in (*reasons, renamed.refused["a"]) if "robot's own" not in reason] == []
-    for profile in ("", "imu.motion.v1"):
+    for profile in ("", "imu.motion.v1", "imu.summary.v1"):
         assert "it needs the profile imu." in refused(state("a", "sensors/imu", profile=profile))
-    topics = {"drive_values": f"{BASE}/incoming/elsewhere"}
+    topics = {"drive_values": f"{BASE}/incoming/elsewhere", "high_rate": f"{BASE}/outgoing/motion"}
     raw = {"robot": {"id": ROBOT}, "services": {"serial_mcu_bridge": {"topics": topics}}}
     config = parse(raw, folder=Path("/"), env={})
     wheels = M("u", (command("a", "elsewhere"), command("b", "drive-values", 2))).describe()
     device = Device(parse_describe(wheels), Addresses(config), ImuReports(SerialBridge(), ""))
     assert device.claims.refused.keys() == {"a", "b"}, "both the topic of the config and that of the contract"
+    sensor = Device(parse_describe(IMU.describe()), Addresses(config), ImuReports(SerialBridge(), ""))
+    assert sensor.claims.granted.keys() == {"outgoing/motion", "outgoing/sensors/imu"}, "that of the config"
 
 
 def test_a_local_only_interface_gets_no_public_channel_without_a_device_uid() -> None:

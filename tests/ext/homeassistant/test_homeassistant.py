@@ -215,6 +215,7 @@ def test_it_is_announced_again_when_home_assistant_starts_and_on_changes(
         assert until(lambda: len(home.devices()) == 1)
         assert (home.devices()[0].topic, int(home.devices()[0].qos)) == (TOPIC, 1)
         assert retained(broker)[TOPIC] == home.devices()[0].payload
+        assert not until(lambda: len(home.devices()) > 1, 1), "without a reason it is not sent again"
         home.transport.publish("homeassistant/status", b"offline", qos=QoS.DELIVERED)
         home.transport.publish("homeassistant/status", b"online", qos=QoS.DELIVERED)
         assert until(lambda: len(home.devices()) == 2)

@@ -112,6 +112,8 @@ def test_jitter_above_the_target_is_learnt() -> None:
     assert sum(at > 20 for at in late) <= sum(at < 20 for at in late)
     assert len(set(played.real)) > 1900
     assert buffer.counters["overflow"] == 0
+    stalls = [(max(at, 2 * (at // 2) + 0.12), raw) for at, raw in on_time(2000)]  # every two seconds
+    assert [at for at, chunk in play(JitterBuffer(), stalls).chunks if chunk.concealed and 20 < at < 39.9] == []
 
 
 # -- gaps
@@ -123,8 +125,9 @@ def test_a_short_gap_is_filled_and_costs_no_time(lost: int) -> None:
     arrivals = [arrival for index, arrival in enumerate(on_time(60)) if not 20 <= index < 20 + lost]
     played = play(buffer, arrivals)
     assert played.real == [*range(20), *range(20 + lost, 60)]
-    first_after = next(at for at, chunk in played.chunks if chunk.samples[-1, 0] == 20 + lost)
+    first_after, chunk = next(played_at for played_at in played.chunks if played_at[1].samples[-1, 0] == 20 + lost)
     assert first_after == pytest.approx(0.06 + 0.02 * (20 + lost))
+    assert chunk.samples[0, 0] == 0, "it fades in"
     assert played.stutters == 0
     assert buffer.counters["lost"] == lost
 

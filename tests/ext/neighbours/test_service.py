@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from pebble.config import Config, parse
+from pebble.config import Config, Mqtt, parse
 from pebble.config.raw import deep_merge
 from pebble.contract import DRIVE, ESTOP_STATE, FROM_NEIGHBOUR, NEIGHBOURS, WHEEL_ODOMETRY, codec
 from pebble.contract.payloads import SCRIPT, Drive, EstopState, Neighbours, WheelOdometry
@@ -26,7 +26,9 @@ from pebble.motion.arbiter import PERSON, Arbiter
 from pebble.motion.latch import Latch
 from pebble.motion.lease import Lease
 from pebble.services.neighbours.begun import begin
+from pebble.services.neighbours.board import of_board
 from pebble.services.neighbours.config import MOST_METRICS, MOST_NEIGHBOURS
+from pebble.services.neighbours.config import Neighbours as NeighboursSection
 from pebble.services.neighbours.service import HEARTBEAT_S, MOST_BYTES, NeighboursService
 from pebble.services.neighbours.visit import Visit
 from pebble.transports import Message, QoS, Transport, clock
@@ -430,3 +432,11 @@ def test_a_zero_of_the_driver_stops_at_once_and_a_command_lasts_no_longer_than_a
         (0.5, 1, 300, sent[0].key), (0.0, 1, 300, sent[0].key)
     ]  # fmt: skip
     assert not isinstance(sent[0].key, str)
+    assert visit.command("goob", Drive(z=0.2, source=SCRIPT, run=7), fred.now)
+    visit.tick(fred.now + 1)
+    assert sent[-1].z == 0.2, "it came before its turn, and is sent then"
+
+
+def test_only_the_user_of_a_gateway_reaches_the_sockets_of_a_board(tmp_path: Path) -> None:
+    of_board("pebble/robots/lamp", NeighboursSection(), Mqtt(), tmp_path)
+    assert [folder.stat().st_mode & 0o777 for folder in tmp_path.iterdir()] == [0o700]

@@ -10,7 +10,6 @@ import re
 import shutil
 import signal
 import socket
-import statistics
 import subprocess
 import sys
 import threading
@@ -191,7 +190,7 @@ def test_a_stopped_sibling_does_not_delay_the_others(robot: ZenohNet) -> None:
     sender.publish("drive", b"end", qos=DELIVERED)
     assert until(lambda: fast.heard() == [151, "end"])
     assert max(times) < SOON_S
-    assert statistics.median(times) < 0.25, "its sockets are full: a bounded wait, once"
+    assert sum(taken > 0.25 for taken in times) <= 10, "its sockets are full: a bounded wait, once"
     resume(stopped)
 
 

@@ -33,7 +33,7 @@ class Intake:
         self._changed, self._room = threading.Condition(self._lock), threading.Condition(self._lock)
         self._tasks, self._queries = deque[tuple[Task, int]](), deque[Task]()
         self._bytes = 0  # of the tasks
-        self._outside = 0  # senders that wait for room
+        self._waiting_senders = 0  # for room
         self._was_task = False  # a task was taken last, so it is the queries' turn
         self._ended = False
 
@@ -47,17 +47,17 @@ class Intake:
         """Queue the task for a received message of ``size`` bytes. Wait for room; drop it if too many others wait."""
         size += OVERHEAD
         with self._lock:
-            if self._outside or not self._has_room(size):
-                if self._outside >= SENDERS:
+            if self._waiting_senders or not self._has_room(size):
+                if self._waiting_senders >= SENDERS:
                     self._note_dropped()
                     return
-                self._outside += 1
+                self._waiting_senders += 1
                 self._room.wait_for(lambda: self._has_room(size))
-                self._outside -= 1
+                self._waiting_senders -= 1
             self._tasks.append((task, size))
             self._bytes += size
             self._changed.notify()
-            self._room.notify()
+            self._room.notify()  # the next sender that waits: there may be room for it as well
 
     def greet(self, work: _OnQuery, query: zenoh.Query) -> None:
         """Queue a hello or goodbye, which counts as a task."""

@@ -51,9 +51,9 @@ class HubWorker:
     def serve(self, session: zenoh.Session) -> None:
         """Serve the clients of ``session``, in place of the former session, which is closed."""
         if self._session is not None:
-            self.post(self._await_return)  # of its clients, before their wills are published
+            self.post(self._await_return)  # its clients get time for that before their wills are published
         self._session = session
-        # Not the hub's own messages: they would wait for room in the queue, which this thread empties.
+        # REMOTE: one of the hub's own would wait for room in the queue on the thread that empties this queue.
         retain = direct(lambda sample: self._intake.receive(partial(self._store_retained, sample), len(sample.payload)))
         session.declare_subscriber(wire.RETAINED + "**", retain, allowed_origin=zenoh.Locality.REMOTE)
         session.declare_queryable(wire.RETAINED + "**", direct(partial(self._intake.ask, self._query)), complete=True)
@@ -86,7 +86,7 @@ class HubWorker:
             if (task := self._intake.take(self._pause())) is None:
                 return
             self._do(task)
-            for query in self._waiting.take(time.monotonic()):
+            for query in self._waiting.take(time.monotonic()):  # nothing is missing for them, or they wait no longer
                 self._intake.ask(self._answer, query)
             self._publish_due_wills()
             if self._journal is not None and time.monotonic() >= self._journal.rewrite_at:
@@ -239,8 +239,8 @@ class HubWorker:
                     self._store.apply(record)
             except msgspec.DecodeError as error:
                 log.warning("journal %s has a record of another kind: %s", journal.path, error)
-        self._write_journal(journal)
-        self._await_wills()
+        self._write_journal(journal)  # without what was replaced, or is not admitted any more
+        self._await_wills()  # of clients that do not come back
 
     def _write_journal(self, journal: Journal) -> None:
         journal.rewrite((record.id, wire.encode(record)) for record in self._store.records())

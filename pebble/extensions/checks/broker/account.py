@@ -38,7 +38,7 @@ def robot_account(
     ``open``, a probe in the name of another robot must not come back.
     """
     try:
-        with reached(settings, "") as trial:
+        with reached(settings, "") as trial:  # "": no topic here is below it, as all are complete
             trial.patience_s = answer_s
             peer, topic = trial.peer(protocol=settings.protocol), BRIDGE_PROBE.topic(base)
             must_come_back = bool(reads) or settings.protocol != "5"  # before MQTT 5 no refusal is told
@@ -49,7 +49,7 @@ def robot_account(
             if level != "open":
                 yield _rules(what, trial, peer, topic)
             if trial.round_trip_s >= _MATTERS_S:
-                result = trial.judge(lambda trial: held_back(trial, peer, peer, topic))
+                result = trial.judge(lambda trial: held_back(trial, peer, peer, topic))  # it reads what it writes
                 yield replace(result, what=f"small messages at {what}")
     except TransportError as error:
         yield warn(f"cannot be published to: {error}", what=what)

@@ -183,22 +183,23 @@ def _pair(trial: BrokerTrial, reader: Peer, writer: Peer, topic: str) -> tuple[f
 
 
 def pings(trial: BrokerTrial) -> CheckResult:
+    """Check that a ping is answered soon, and behind the messages that were sent before it."""
     peer = trial.peer()
     peer.subscribe("#", qos=0)
     began = time.monotonic()
     if not peer.ping():
         return failed("it does not answer a ping", "use another broker: robots would connect anew all the time")
     seconds = time.monotonic() - began
-    late = max(_late(trial, peer) for _ in range(_PING_TRIES))
+    overtaken = max(_overtaken(trial, peer) for _ in range(_PING_TRIES))
     if seconds > _PING_S:
         trial.late = True
         return failed(f"it takes {seconds:.1f} s for one", "use a broker that is nearer, or less busy")
-    if late:
-        return warn(f"it answers before it has passed on what came before ({late} of 20 messages)")
+    if overtaken:
+        return warn(f"it answers before it has passed on what came before ({overtaken} of 20 messages)")
     return ok(f"after {1000 * seconds:.1f} ms, behind what came before")
 
 
-def _late(trial: BrokerTrial, peer: Peer) -> int:
+def _overtaken(trial: BrokerTrial, peer: Peer) -> int:
     """Send twenty messages and then a ping; return how many of the messages arrive after the ping's answer."""
     for place in range(20):
         peer.publish("x", b"%d" % place)
@@ -255,6 +256,7 @@ def _lacks_of_flags(trial: BrokerTrial, peer: Peer, *, modern: bool) -> str:
 
 
 def last_will(trial: BrokerTrial) -> CheckResult:
+    """Check that the will of a client whose connection is reset is published soon, and retained."""
     reader, retain = trial.peer(), trial.retains
     reader.subscribe("#", qos=trial.qos)
     try:
@@ -266,11 +268,11 @@ def last_will(trial: BrokerTrial) -> CheckResult:
     began = time.monotonic()
     robot.cut()
     if not trial.wait(lambda: b"gone" in reader.payloads(), 3 * trial.answer_s):
-        trial.late = True
+        trial.late = True  # so that `judge` tests a second time
         return warn("none is published when a connection is reset", "allow wills (an access list may forbid them)")
     seconds = time.monotonic() - began
     if seconds > _WILL_S + trial.round_trip_s:
-        trial.late = True
+        trial.late = True  # as above
         return warn(f"one is published {seconds:.1f} s after the connection is reset")
     late = trial.peer()
     late.subscribe("online", qos=trial.qos)

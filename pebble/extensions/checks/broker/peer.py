@@ -276,7 +276,7 @@ class BrokerTrial:
             lambda: condition() or all(peer.closed or len(peer.pongs) > before for peer, before in asked.items()),
             _MORE_PATIENCE * self.answer_s,
         )
-        came = self._serve(condition, _QUIET_S)
+        came = self._serve(condition, _QUIET_S)  # after so much silence nothing more comes
         self.late |= came
         return came
 

@@ -8,7 +8,7 @@ from pebble.extensions.checks.broker.peer import BrokerTrial, Peer, RefusedError
 
 _STATES = 200  # retained ones; a robot has some twenty
 _TRIES = 6  # to get the retained message after a restart
-_BY_NAME = 8  # filters in one SUBSCRIBE: AWS IoT closes the connection for more
+_MOST_FILTERS = 8  # filters in one SUBSCRIBE: AWS IoT closes the connection for more
 _PERSISTENT = f"{MOSQUITTO}persistence true, persistence_location /var/lib/mosquitto/, autosave_on_changes true"
 
 
@@ -29,6 +29,7 @@ def _retain_states(trial: BrokerTrial) -> list[str]:
 
 
 def by_wildcard(trial: BrokerTrial) -> CheckResult:
+    """Check that a subscription with a wildcard gets all retained messages: the worse of two filters counts."""
     names = set(_retain_states(trial))
     counts = []
     for filter_ in ("s/+", "#"):
@@ -36,19 +37,20 @@ def by_wildcard(trial: BrokerTrial) -> CheckResult:
         reader.subscribe(filter_, qos=0)
         trial.wait(lambda: len(reader.topics()) == len(names) or reader.closed)  # noqa: B023
         counts.append(len(reader.topics() & names))
-    trial.wildcards = min(counts) > 0
-    if not min(counts):
+    fewest = min(counts)
+    trial.wildcards = fewest > 0
+    if not fewest:
         return warn("nothing comes: only subscriptions of exact names get retained messages")
-    if min(counts) < len(names):
-        return failed(f"{min(counts)} of {len(names)} come", f"{MOSQUITTO}max_queued_messages 1000")
+    if fewest < len(names):
+        return failed(f"{fewest} of {len(names)} come", f"{MOSQUITTO}max_queued_messages 1000")
     return ok(f"all {len(names)}")
 
 
 def before_pong(trial: BrokerTrial) -> CheckResult:
     """Check that retained messages come before the answer to a ping that was sent after the subscription."""
     names, reader = _retain_states(trial), trial.peer()
-    expected = len(names) if trial.wildcards else _BY_NAME
-    filters = ["#"] if trial.wildcards else names[:expected]
+    expected = len(names) if trial.wildcards else _MOST_FILTERS
+    filters = ["#"] if trial.wildcards else names[:expected]  # by name, as many as one SUBSCRIBE may have
     reader.subscribe(*filters, qos=0)
     reader.ping()
     trial.wait(lambda: len(reader.received) >= expected)
@@ -69,9 +71,10 @@ def order(trial: BrokerTrial) -> CheckResult:
     trial.wait(lambda: all(b"%d" % newest in reader.payloads() for reader in readers))
     trial.wait_quiet(*readers)
     wrong = [reader for reader in readers if reader.payloads()[-1:] != [b"%d" % newest]]
-    # A last message with the retain flag was sent for the subscription, but later than newer live ones. Without the
-    # flag, the newest one is lost, or came before an older live one.
-    if any(not reader.received or not reader.received[-1].retain for reader in wrong):
+    # Of these, the newest message is lost, or came before an older live one. The other readers got a message with the
+    # retain flag last: it was sent for the subscription, but later than newer live ones.
+    live_last = [reader for reader in wrong if not reader.received or not reader.received[-1].retain]
+    if live_last:
         return failed("the last value that comes to a new subscription is not the newest", OTHER)
     if wrong:
         return warn("a retained value comes after a newer live one")
@@ -86,6 +89,7 @@ def _has_older_after_newer(reader: Peer) -> bool:
 
 
 def restarted(trial: BrokerTrial) -> CheckResult:
+    """Check that a retained message is there again after a restart of the broker, for which a person is asked."""
     writer = trial.peer()
     mid = writer.publish("state", b"1", qos=trial.qos, retain=True)
     trial.wait(lambda: mid in writer.acks or not trial.qos)
@@ -101,5 +105,5 @@ def restarted(trial: BrokerTrial) -> CheckResult:
         late.subscribe("state", qos=trial.qos)
         if trial.wait(lambda: late.received, trial.answer_s / 3):  # noqa: B023
             return ok("it is there again" + (", some seconds later" if attempt else ""))
-    trial.late = False  # else this was tried again, and a person asked for a second restart
+    trial.late = False  # after a late answer `judge` would try this again, and ask a person for a second restart
     return warn("it is gone", _PERSISTENT)

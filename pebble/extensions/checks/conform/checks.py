@@ -84,7 +84,7 @@ def heartbeat(robot: Observer) -> CheckResult:
     interval = robot.view.liveness.interval_s
     if len(gaps) < 2 or interval is None:
         return failed(f"{len(beats)} in the time of observation", "publish one at least every second")
-    longest = silent_after(interval, robot.view.liveness.link, 0.0)
+    longest = silent_after(interval, robot.view.liveness.link, 0.0)  # 0.0: nothing for delays on the way
     if max(gaps) > longest:
         return failed(f"a gap of {max(gaps):.1f} s, where {longest:.1f} s counts as silence", "publish them evenly")
     if interval > _SLOWEST_S and robot.view.liveness.link == "wide":
@@ -180,6 +180,7 @@ def capabilities(robot: Observer) -> CheckResult:
 
 
 def own_topics(robot: Observer) -> CheckResult:
+    """Check that all topics in the capabilities are the robot's own, and valid."""
     foreign = {
         f"{path} is {topic}"
         for path, topic in _topics(robot.view.capabilities, "")

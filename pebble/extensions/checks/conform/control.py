@@ -104,6 +104,7 @@ def _with_control(test: Callable[[Observer, Driver], CheckResult]) -> Callable[[
 
 
 def _first_keeps(robot: Observer, driver: Driver) -> CheckResult:
+    """Check that the state names who has control, and that a second request does not take it."""
     by = "" if driver.state is None else driver.state.by
     if robot.view.named and by.partition("/")[0] != robot.account:
         return failed(f"its state tells that {by!r} has it", "at level named, by begins with the account in the topic")

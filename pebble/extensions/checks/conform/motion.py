@@ -73,9 +73,9 @@ def _swings(readings: list[tuple[float, Any]]) -> Iterator[float]:
 
 
 def _wheel_reports(robot: Observer) -> list[tuple[float, list[float]]]:
-    """Return the wheel speeds, each with its time: those that ``robot.eyes`` saw; if it saw none, the reported ones."""
+    """Return the wheel speeds, each with its time: as seen from outside (``robot.eyes``), or else as reported."""
     reports = [(report.at, report.value.value.get("wheels")) for report in robot.of(c.STATUS) if report.value]
-    return robot.eyes() or [(at, wheels) for at, wheels in reports if _are_wheels(wheels)]
+    return robot.eyes() or [(at, wheels) for at, wheels in reports if _are_speeds(wheels)]
 
 
 def _odometry_wheels(robot: Observer) -> list[tuple[float, list[float]]]:
@@ -85,7 +85,7 @@ def _odometry_wheels(robot: Observer) -> list[tuple[float, list[float]]]:
         value: dict[str, Any] = record.value.value if record.value else {}
         linear: Any = value.get("linear_speed_mps")
         angular: Any = value.get("angular_speed_radps")
-        if _are_wheels([linear, angular]):
+        if _are_speeds([linear, angular]):
             ahead_mps, turn_mps = round(float(linear), 2), _HALF_TRACK_M * round(float(angular), 2)
             speeds.append((record.at, [ahead_mps - turn_mps, ahead_mps + turn_mps]))
     return speeds
@@ -105,7 +105,7 @@ def _moving_wheels(robot: Observer, since: float) -> list[float] | None:
     return newest_moving() if reports() else None
 
 
-def _are_wheels(value: Any) -> bool:
+def _are_speeds(value: Any) -> bool:
     return isinstance(value, list) and len(value) > 0 and all(isinstance(speed, int | float) for speed in value)
 
 
@@ -122,7 +122,7 @@ def at_the_wheel(robot: Observer, by: str = BY, answer_s: float = ANSWER_S) -> I
             robot.answers(lambda: driver.holds, answer_s)
         if driver.may_drive:
             driver.send()
-            robot.wait(lambda: moves_until(robot, time.monotonic()) != inf, ANSWER_S)  # until it is not seen to move
+            robot.wait(lambda: moves_until(robot, time.monotonic()) != inf, ANSWER_S)  # inf: it still moves
         yield driver
     finally:
         if driver.may_drive:
@@ -151,7 +151,7 @@ def rested(robot: Observer, began: float, last: float, limit_s: float, what: str
     until = moves_until(robot, began)
     if until is None:
         return _NOT_SHOWN
-    if until == 0.0:
+    if until == 0.0:  # no motion was seen
         return failed("its commands do not move it", "drive by incoming/drive-values, live ones")
     if until > last + limit_s + LATE_S / 2:  # ``until`` is when a report arrived, a little after the motion
         shown = "still moves" if until == inf else f"moved for {until - last:.2f} s"
@@ -199,7 +199,8 @@ def _steering(robot: Observer, driver: Driver) -> CheckResult:
         wheels = _moving_wheels(robot, began)
         if wheels is None:
             return _NOT_SHOWN
-        if [speed * sign > 0 for speed, sign in zip(wheels, signs, strict=False)] != [True, True]:
+        are_right = len(wheels) > 1 and all(speed * sign > 0 for speed, sign in zip(wheels, signs, strict=False))
+        if not are_right:
             sent = f"x {fields.get('x', 0):g}, z {fields['z']:g}"
             if "wrapped" in fields:
                 sent += " within value"
@@ -225,7 +226,7 @@ def _reset_waits(robot: Observer, driver: Driver) -> CheckResult:
     began, _ = driver.drive(2 * STEP_S)  # from before the reset on: a pause would count as a release
     reset(robot)
     driver.drive(DRIVES_S / 2)
-    if robot.view.controlled:
+    if robot.view.controlled:  # it knows by the key whose zero it is
         driver.send(key=_OTHER_KEY)  # a zero
     driver.drive()
     why = "a stick that is held down moves it after a reset"
@@ -245,6 +246,7 @@ def _not_a_number(robot: Observer, _driver: Driver) -> CheckResult:
 
 
 def _clamped(robot: Observer, driver: Driver) -> CheckResult:
+    """Check that no wheel gets more than full power by axes beyond -1..1."""
     began, _ = driver.drive(DRIVES_S / 2, z=9, x=-9)
     wheels = _moving_wheels(robot, began)
     if wheels is None or not _wheel_reports(robot):  # speeds by odometry are good for their signs only

@@ -61,7 +61,7 @@ def free(robot: RobotUnderTest) -> str:
 
 def processes(robot: RobotUnderTest) -> CheckResult:
     """Check that the robot answers on its own transport, and that each of its processes is ready."""
-    if why := robot.why_own or running(robot):
+    if why := robot.why_own or running(robot):  # why_own: its own transport could not be reached
         return failed(why, "sudo systemctl start pebble, or pebble up CONFIG; and test it as the robot's user or root")
     if not robot.wait(lambda: _unready(robot) == [], robot.patience_s):
         return failed(", ".join(_unready(robot)), _LOG)

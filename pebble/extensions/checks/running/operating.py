@@ -101,6 +101,7 @@ def _end(robot: RobotUnderTest, name: str, before: dict[str, list[str]]) -> str:
     if not view.latched:
         return ""
     for owner, state in view.estop.latched.items():
+        # this stop is not the newest, or another one came before it since ``before``
         if state.recent[:1] != [name] or not set(state.recent[1:]) <= set(before.get(owner, [])):
             return f"it was stopped by another one meanwhile, and stays so ({state.by or 'unknown'}: {state.why})"
     reset = Reset(view.estop, robot.by)
@@ -117,7 +118,7 @@ def retained_commands(robot: RobotUnderTest) -> CheckResult:
     reset of another kind follows, which must be answered: this shows that the silence before was no accident.
     """
     operators = robot.commanding_side
-    if robot.own_side.heartbeats:  # which the bridge sends to the operators' broker only
+    if robot.own_side.heartbeats:  # the bridge sends them to the operators' broker only: so it is this one
         return skipped("one broker serves both sides: there, what is published to be retained is live at first")
     owner, state = next(iter(robot.view.estop.states.items()), (None, None))
     if owner is None or state is None:
@@ -168,8 +169,9 @@ def wheels(robot: RobotUnderTest) -> CheckResult:
 
 
 def _drive(robot: RobotUnderTest, driver: Driver, speed: float) -> CheckResult:
+    """Drive for a moment; judge by the robot's own reports whether it moved, and came to rest."""
     began, last = driver.drive(_DRIVES_S, z=speed)
-    robot.wait(lambda: False, robot.rests_s + LATE_S)
+    robot.wait(lambda: False, robot.rests_s + LATE_S)  # in any case: until it must rest
     if robot.view.latched:
         return failed("it was stopped meanwhile", "pebble estop status CONFIG")
     if not driver.may_drive:

@@ -315,6 +315,7 @@ def register(app: typer.Typer) -> None:
 
 
 def _init_again(place: Path, host: str | None, level: str | None, plain: bool | None) -> int:
+    """Change the level of a fleet that exists, and whether its topics are plain; None leaves either as it is."""
     if host is not None:
         raise PebbleError(f"{_shown(place)} is a fleet already, so leave out --host; another host needs another folder")
     with _locked_fleet(place) as (_, fleet):

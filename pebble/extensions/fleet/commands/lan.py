@@ -130,6 +130,7 @@ def _commands(place: Path) -> dict[str, list[str]]:
     mosquitto = mosquitto_path()
     if mosquitto is None:
         raise PebbleError("mosquitto is not installed: sudo apt install mosquitto")
+    # a broker that runs already is not started again
     broker = {} if applying.pid_of(place) else {"broker": [mosquitto, "-c", str(place / CONF)]}
     return broker | hub | {"gateway": [*pebble, "fleet", "gateway", str(place / GATEWAY_FILE)]}
 

@@ -37,7 +37,7 @@ class NamedSubjects(Subjects):
     """A robot's subjects without renamed topics, but with the topics that have an account's name."""
 
     def _find(self, topic: str) -> Subject | None:
-        """Return the subject of a topic. A topic with an account's name has that of the same topic without the name."""
+        """Return the subject of a topic. For a topic with an account's name, look up the topic without the name."""
         if not topic.startswith(f"{self._base}/{INCOMING}/{BY}/"):
             return super()._find(topic)
         named = without_name(topic)
@@ -45,7 +45,7 @@ class NamedSubjects(Subjects):
         subject = None if plain is None else super()._find(plain)
         if subject is None or subject.kind is not Kind.FLAG:
             return subject
-        return self._subject(Kind.COMMAND, subject.channel, subject.qos)  # nothing is retained behind a name
+        return self._subject(Kind.COMMAND, subject.channel, subject.qos)  # with a name it is not retained
 
 
 class Beginning:
@@ -113,8 +113,8 @@ def _subscribe(robots: Sequence["CarriedRobot"], side: Side, transport: Transpor
 class CarriedRobot:
     """A robot of the hub for which the gateway forwards.
 
-    ``stops_pass()``: True if another connection carries stops; called for each stop. ``too_large``: called with the
-    topic of a message that is too large for any broker.
+    ``stops_pass()``: True if stops pass by another connection, so that this forwarder leaves them out; called for each
+    stop. ``too_large``: called with the topic of a message that is too large for any broker.
     """
 
     def __init__(

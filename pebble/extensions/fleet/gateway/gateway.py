@@ -178,7 +178,7 @@ class Gateway:
                     "robots of a LAN"
                 )
             self._quiet_log.warning(base, "gateway %s carries %s: this one leaves it", other, base)
-            self._end(self.carries & {base})
+            self._end(self.carries & {base})  # it may be heard, but not carried
 
     def _begin(self, now: float) -> None:
         """Begin to carry robots that were heard and that no gateway carries, at most TOGETHER of them."""
@@ -195,7 +195,7 @@ class Gateway:
             for base in waiting[:TOGETHER]
         ]
         for transport in (hub, broker):
-            transport.policy.is_stop = is_stop  # instead of the newest forwarder's, which knows its own robot
+            transport.policy.is_stop = is_stop  # each Forwarder has set it for its own robot only
         self._has_begun = True
         self._carried |= {robot.base: robot for robot in robots}
         with self._beginning:  # measures how long this takes
@@ -221,13 +221,15 @@ class Gateway:
         self._listens_since = self._clock() if state is State.CONNECTED else float("inf")
 
     def _on_robot(self, message: Message) -> None:
+        """Note a live heartbeat of a robot."""
         address, payload = parse_topic(message.topic), message.payload
         if not payload or address is None or address.identity.is_server:
             return
         base = address.identity.base
-        may_be_old = message.retain  # with ``as_published`` live heartbeats are marked so, too
-        if may_be_old and not (self._hub.as_published and self._differs(base, payload)):
-            return
+        if message.retain:
+            may_be_live = self._hub.as_published  # then live heartbeats are marked so, too
+            if not (may_be_live and self._differs(base, payload)):
+                return
         if base in self._heard or len(self._heard) < MAX_ROBOTS:
             self._heard[base] = self._clock()
         else:
@@ -243,6 +245,7 @@ class Gateway:
         return self._first.setdefault(base, heartbeat) != heartbeat
 
     def _on_gateway(self, message: Message) -> None:
+        """Note a gateway's heartbeat, or its end, an empty message. A retained one shows no live gateway."""
         address = parse_topic(message.topic)
         if address is None:
             return

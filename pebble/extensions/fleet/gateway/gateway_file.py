@@ -91,7 +91,7 @@ def _check_sides(notes: Notes, gateway: GatewayFile, operators: Mqtt | None) -> 
 
 
 def _check_neighbours(notes: Notes, gateway: GatewayFile) -> None:
-    """Note mistakes in ``neighbours``: for each board, what services.neighbours is for a robot with programs."""
+    """Note mistakes in ``neighbours``: it does for each board what services.neighbours does in a robot's own config."""
     if gateway.neighbours and gateway.boards is None:
         notes.problem(("neighbours",), "must be left out without boards: a robot at a hub has its own")
     if len(gateway.neighbours) > MOST_BOARDS:

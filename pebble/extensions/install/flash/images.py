@@ -19,7 +19,7 @@ def check_image(path: Path, board: Board) -> None:
             header = file.read(512)
     except OSError as error:
         raise PebbleError(f"--micropython {path}: {error.strerror}") from None
-    problem = _uf2(header) if board.chip is None else _esp(header, board)
+    problem = _uf2(header) if board.chip is None else _esp(header, board)  # None: its boot loader takes UF2 files
     if problem:
         raise PebbleError(f"--micropython {path}: {problem}; download {board.download}")
 

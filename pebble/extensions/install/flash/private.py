@@ -94,7 +94,7 @@ def _der(path: Path) -> bytes:
     except OSError as error:
         raise ConfigError(f"local_mqtt.tls.ca_cert: {path}: {error.strerror}") from None
     if not content.startswith(b"-----BEGIN") and b"-----BEGIN CERTIFICATE-----" not in content:
-        return content
+        return content  # it is no PEM, so it is DER already
     if content.count(b"-----BEGIN CERTIFICATE-----") != 1:
         raise ConfigError(f"local_mqtt.tls.ca_cert: {path} must contain exactly one certificate for a board")
     try:

@@ -97,7 +97,7 @@ class Steps:
 
     def _micropython(self) -> list[Step]:
         image = self._options.micropython
-        assert image is not None  # noqa: S101 - asked by all()
+        assert image is not None  # noqa: S101 - `all` asks for these steps only with one
         check = Step(
             title=f"check: {image.name} is MicroPython for {self._board.title}",
             act=lambda: images.check_image(image, self._board),
@@ -136,7 +136,7 @@ class Steps:
 
     def _check_board(self) -> list[Step]:
         """Return the steps that stop the board's program, and ask its MicroPython what it is."""
-        pulse = self._board.chip is not None
+        pulse = self._board.chip is not None  # the boards for esptool can be reset by the line's RTS
         how = "reset the board by RTS, then Ctrl-C" if pulse else "Ctrl-C; if the board ignores it, press reset"
 
         def interrupt() -> None:

@@ -122,8 +122,8 @@ def _ask_page(job: Job, number: str) -> _Given:
     if job.answers.broker == NONE:
         return {"page": False}
     _ask(f"{number} May phones and computers in this network open the robot's page?")
-    is_usual = job.answers.page is not False  # also if it is not answered yet
-    if not typer.confirm("   Page", default=is_usual):
+    yes_by_default = job.answers.page is not False  # also if it is not answered yet
+    if not typer.confirm("   Page", default=yes_by_default):
         return {"page": False}
     if has_user(job.people):
         return {"page": True}

@@ -66,13 +66,14 @@ def restore(system: System, file: Path, agree: Callable[[Sequence[str]], None]) 
         target = places.root / name
         for folder in reversed(target.parents):
             if not folder.exists():
+                # By the slash a folder of _PLACES counts as below itself.
                 owner, mode = _PLACES.get(_place(f"{folder.relative_to(places.root)}/"), _SHARED)
                 system.make_folder(folder, mode, owner)
         if not places.unfinished.exists() and places.etc.is_dir():
-            system.write(places.unfinished, b"")  # no service uses the files before setup has done its steps
+            system.write(places.unfinished, b"")  # with it no service uses the files before setup has done its steps
         if not target.exists():
             owner, _ = _PLACES[_place(name)]
-            system.write(target, saved.content, saved.mode & 0o755, owner)
+            system.write(target, saved.content, saved.mode & 0o755, owner)  # only the owner may write
     if (places.broker_folder / FLEET).is_file():
         # The broker's rules in the backup may have been changed: they are made anew from its accounts.
         with as_owner(places.broker_folder):

@@ -115,7 +115,7 @@ class Job:
         """Raise AnswersError with the keys that still need an answer."""
         answers, secrets = self.answers, self.secrets
         is_known = answers.user is not None and has_user(self.people, answers.user)
-        is_there = {
+        is_settled = {  # given, or not needed
             "id": answers.id is not None,
             "port": answers.port is not None,
             "protocol": answers.protocol is not None or answers.port in (None, NONE),
@@ -127,7 +127,7 @@ class Job:
             "user": answers.user is not None or not self.needs_user,
             "password_file": secrets.password is not None or not self.needs_user or is_known,
         }
-        if missing := [key for key, has_answer in is_there.items() if not has_answer]:
+        if missing := [key for key, settled in is_settled.items() if not settled]:
             raise AnswersError("\n".join(f"{key} is missing: {KEYS[key]}" for key in missing))
 
     # -- the steps
@@ -185,6 +185,7 @@ class Job:
             "accounts, rules and certificate of the robot's own broker",
             lambda: folder.is_dir() and own_broker.knows(folder, wanted, passwords()),
             make_or_change,
+            # `change` makes a running broker read its files at once; after `make` it has to be restarted.
             (ROBOT_SERVICE,) if folder.is_dir() else (BROKER_SERVICE, ROBOT_SERVICE),
         )
         yield self._file(
@@ -266,11 +267,11 @@ class Job:
         """
         unfinished = self.places.unfinished
         services = {service for step in steps for service in step.restarts}
-        if unfinished.exists():
+        if unfinished.exists():  # of a setup that failed before its restarts, or of a backup that was restored
             services |= {ROBOT_SERVICE, *([BROKER_SERVICE] if self.answers.broker == HERE else [])}
         try:
             for step in steps:
-                if not unfinished.exists():
+                if not unfinished.exists():  # written with the first step: without any, nothing is unfinished
                     self.system.write(unfinished, b"")
                 step.do()
             for service in (BROKER_SERVICE, ROBOT_SERVICE):

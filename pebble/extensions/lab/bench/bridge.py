@@ -6,7 +6,7 @@ the operator's publish call to the last byte of the command's line at the MCU's 
 the operator. Under ``commands`` robots forward no reports. CPU is that of the process that bridges and of the one that
 owns the serial line, for each command and report that they forwarded. Each round starts fresh robots. They
 are driven in turns of a second, one after another; every other time in reverse order. Commands and reports that take
-longer than a second are lost, and commands that a newer one overtook.
+longer than a second count as lost, and so do commands that a newer one overtook.
 """
 
 from __future__ import annotations

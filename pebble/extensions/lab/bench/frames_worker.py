@@ -93,6 +93,7 @@ class ZenohWriter:
         self.close = self._writer.close
 
     def write(self, fill: Fill) -> bool:
+        """Send the frame that ``fill`` writes; return False, without one, while there is no reader."""
         if not self._writer.wanted:
             return False
         slot = self._writer.slot(len(self._frame))
@@ -135,6 +136,7 @@ class MqttWriter:
         self.close = self._client.disconnect
 
     def write(self, fill: Fill) -> bool:
+        """Send the frame that ``fill`` writes; return False, without one, while the last one is still being sent."""
         if self._leaving is not None and not self._leaving.is_published():
             return False
         fill(np.frombuffer(self._frame, np.uint8))
@@ -195,6 +197,7 @@ class GstWriter:
         self._allocator = query.parse_nth_allocation_param(0)[0]
 
     def write(self, fill: Fill) -> bool:
+        """Send the frame that ``fill`` writes; return False, without one, if no buffer can be allocated."""
         buffer = Gst.Buffer.new_allocate(self._allocator, self._size, None)
         if buffer is None:
             return False

@@ -62,6 +62,7 @@ def lines(name: str, caption: str, cells: Sequence[Cell], *, over: str) -> list[
 
 
 def _lines(cells: Sequence[Cell], title: str, over: str) -> Figure:
+    """Return the figure: for each measure a chart of the medians of each variant, over the parameter ``over``."""
     by_measure, style_of = grouped(cells, lambda cell: cell.measure), styles([cell.variant for cell in cells])
     figure, all_axes = panels(len(by_measure), 3, (3.9, 3.0), title)
     for axes, (measure, group) in zip(all_axes, by_measure.items(), strict=True):

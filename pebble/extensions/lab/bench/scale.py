@@ -75,6 +75,7 @@ def run(settings: Settings, console: Console) -> Shown:
             yield from measure(boards, settings.seconds)
 
     measure_rounds(results, 1, measure_all, console)
+    # Of the CPU times only the page server's; latency and memory have no process.
     cells = [cell for cell in results.cells if cell.params.get("process") in (None, PAGE)]
     return Shown(results, [table(results)], plots.lines("scale", "What boards cost", cells, over="boards"))
 

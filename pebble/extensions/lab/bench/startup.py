@@ -127,7 +127,7 @@ def launch(variant: str, joins: int) -> Iterator[Cell]:
             robot.expect(lambda: subscriber.first_heartbeat_ns is not None, "no heartbeat", UP_S)
             robot.expect(lambda: subscriber.ready_ns is not None, "not every service is ready", UP_S)
             times_ns = [subscriber.first_heartbeat_ns or 0, subscriber.ready_ns or 0]
-            if not part:  # the others have no motors
+            if not part:  # a whole robot; minimal ones and floors have no motors
                 robot.expect(lambda: bool(_obeyed(robot, began_ns)), "no drive command was obeyed", UP_S)
                 times_ns.append(_obeyed(robot, began_ns)[0])
         for name, at_ns in zip(STARTED, times_ns, strict=False):

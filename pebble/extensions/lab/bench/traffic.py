@@ -113,7 +113,7 @@ def record(folder: Path, idle_s: float, session_s: float) -> None:
             raise PebbleError("; ".join(problems))
         time.sleep(_LAST_S)
         end_all([recorder], _END_S)
-        testbed.keep = False
+        testbed.keep = False  # its logs are needed only after a problem
 
 
 def _use(testbed: Testbed, seconds: float) -> None:

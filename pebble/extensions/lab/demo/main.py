@@ -103,9 +103,10 @@ class Demo:
             problems = self._testbed.unexpected_exits()
         finally:
             self._operator.close()
-        if missing and not self._ending.is_set():
+        if missing and not self._ending.is_set():  # otherwise they were not waited for
             return problems + [f"{name} did not become ready to drive within {_DISCOVERY_S:.0f} s" for name in missing]
-        return problems + [f"{robot.name}: {'; '.join(wrong)}" for robot in robots if (wrong := self._wrong(robot))]
+        wrong_by_robot = ((robot, self._wrong(robot)) for robot in robots)
+        return problems + [f"{robot.name}: {'; '.join(wrong)}" for robot, wrong in wrong_by_robot if wrong]
 
     def show_results(self, problems: list[str]) -> None:
         show_outcomes(self._console, ROBOTS, self._outcomes)

@@ -1,4 +1,4 @@
-"""A scripted operator of a broker's robots: it drives steps, an emergency stop, and a script that it overrules.
+"""A scripted operator of a broker's robots: it drives them in steps, stops them all, and overrules a script.
 
 It yields to people: a robot that another person drives, or has stopped, is left alone until the next step. Times are
 seconds of time.monotonic().
@@ -94,7 +94,7 @@ class EndedEarlyError(Exception):
 class Operator:
     """The demo's driver, with a thread and a connection of its own.
 
-    ``activity`` and ``events`` (seconds and a line) are for display. ``visitors`` knows the robots that people have.
+    ``activity`` and ``events`` (seconds and a line) are for display. ``visitors`` notes the robots that people take.
     ``completed`` collects the commands that were driven. The emergency stop and the script belong to the first round.
     """
 
@@ -315,7 +315,7 @@ class Operator:
         self._complete(AFTER_RESET, _FORWARD, reset_at, released, time.monotonic())
 
     def _show_trails(self, robots: Sequence[RobotView]) -> None:
-        """Start the script that publishes a robot's position on each robot that has it, unless it runs another script.
+        """Start the script that publishes the position, on each robot that has this script and runs none.
 
         A robot that is stopped, or was driven a moment ago, refuses to start a script.
         """
@@ -377,7 +377,7 @@ class Operator:
             self._hold(_BACK, _OVERRIDE_S)
             released = self._drive(STOP)
             self.show(f"LETS GO: {robot.name} waits {HOLD_S:.0f} s for another command")
-            self._wait(HOLD_S - _BEFORE_SCRIPT_S)
+            self._wait(HOLD_S - _BEFORE_SCRIPT_S)  # the record of the command ends while nothing moves the robot
             self._complete(TAKE_OVER, _BACK, took_over, released, time.monotonic())
             self._until(script_drives, _STATUS_S)
             self.show(f"GIVES BACK: {FOLLOW} drives {robot.name} again")

@@ -25,7 +25,8 @@ class Visitors:
         self._name = name
         self._had: dict[str, tuple[float, str]] = {}  # by base topic: when a person last had it, and who
         self._moved: dict[str, float] = {}  # by base topic: when a person's last command came
-        self._sent: defaultdict[str, deque[bytes]] = defaultdict(partial(deque, maxlen=_SENT))  # by topic
+        #: By topic: payloads of the operator's own commands that the broker has not sent back yet.
+        self._sent: defaultdict[str, deque[bytes]] = defaultdict(partial(deque, maxlen=_SENT))
         self._step_began = 0.0
 
     def note_sent(self, topic: str, payload: bytes) -> None:

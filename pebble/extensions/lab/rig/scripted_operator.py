@@ -37,8 +37,8 @@ def paced(
 class ScriptedOperator:
     """The operator of one robot; one thread calls it.
 
-    Its owner passes the robot's messages to ``robot``. ``publish`` sends a message at once. ``wait`` waits so many
-    seconds; an exception from it, or true, ends what is being done. ``device`` is shown to people who want control.
+    Its owner passes the robot's messages to ``robot``. ``publish`` sends a message at once. If ``wait(seconds)``
+    returns true or raises an exception, what is being done ends. ``device`` is shown to people who want control.
     """
 
     def __init__(

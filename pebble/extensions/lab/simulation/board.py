@@ -82,7 +82,7 @@ class SimulatedMcu:
         output = self._advance(now, self.profile.tick_s)
         self.board.console.type(data)
         output += self._turn(now)
-        while (unread := self.board.console.unread) and self._clock.now() <= now:  # later: the firmware blocks
+        while (unread := self.board.console.unread) and self._clock.now() <= now:  # past ``now`` the firmware blocks
             output += self._turn(now)
             if self.board.console.unread == unread:  # the firmware reads nothing now
                 break

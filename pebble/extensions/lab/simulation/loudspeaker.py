@@ -131,7 +131,7 @@ def _play(sound: _Sound, recorder: _Recorder) -> bool:
             time.sleep(max(0.0, due - time.monotonic()))
     except _StoppedError:
         stopped = True
-    for number in (signal.SIGTERM, signal.SIGINT):
+    for number in (signal.SIGTERM, signal.SIGINT):  # else a second signal could interrupt what follows
         signal.signal(number, signal.SIG_IGN)
     recorder.end(frames, stopped=stopped)
     return not stopped

@@ -188,7 +188,11 @@ class PtyMcu:
             time.sleep(self._tick_s if self._master is None else min(self._tick_s, _NO_HOST_S))
 
     def _poll_host(self, master: int) -> None:
-        """Receive from the host, and note when a program opens or closes the port."""
+        """Receive from the host, and note when a program opens or closes the port.
+
+        A pty hangs up while no program has it open, also before the first one. The data of a program that has closed it
+        are read first: they may be all that shows that it was open.
+        """
         poller = select.poll()
         poller.register(master, select.POLLIN)
         events = poller.poll(0)

@@ -212,7 +212,7 @@ class FrameReader:
         return info.sequence - number - 1 if info.writer == writer else 0
 
     def _on_writer(self, sample: zenoh.Sample) -> None:
-        """Note that a writer begins or ends; let the session be reopened if sharing memory with it changes."""
+        """Note that a writer begins or ends; let the session be reopened to begin or to stop sharing memory with it."""
         try:
             writer_id, size, segment = self._names.writer_of(str(sample.key_expr))
         except ValueError:

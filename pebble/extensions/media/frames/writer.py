@@ -56,17 +56,17 @@ class FrameWriter:
         self.counters = Counters()
         self.problem = ""
         self._retry_at = _NEVER  # when room in shared memory is looked for again
-        self._writer_id = 0
-        self._pid = 0
-        self._sequence = 0
+        self._writer_id = 0  # of the present opening
+        self._pid = 0  # of the process that opened the session: no fork of it can use it
+        self._sequence = 0  # the number of the newest frame
         self._closing = threading.Lock()
         self._session: zenoh.Session | None = None
         #: For small messages, and for pictures sent as bytes.
         self._publishers: tuple[zenoh.Publisher, zenoh.Publisher] | None = None
         self._pool: SharedPool | None = None
-        self._lock: FileLock | None = None
+        self._lock: FileLock | None = None  # held while open: it shows that this writer is not dead
         self._memory: Path | None = None  # the pool's file
-        self._tokens: list[Any] = []
+        self._tokens: list[Any] = []  # by which readers see this writer, and it sees them
         self._readers: set[str] = set()  # keys of their tokens
 
     # -- opening and closing

@@ -70,7 +70,7 @@ class RobotStop:
         self._sent_at = float("-inf")
         self._script_ended = False  # the end of a script was sent
         self._given_up = False
-        self._names_due = False  # due again: after it was sent, capabilities came by which topics name the sender
+        self._names_due = False  # to be sent again: newer capabilities say that topics name the sender
         self._status_topic, self._online_topic = STATUS.topic(base), ONLINE.topic(base)
         self._is_offline = False  # as the newest retained heartbeat says
         self.stamp = 0.0  # the newest stamp of the messages that its broker retains, in epoch seconds
@@ -82,6 +82,7 @@ class RobotStop:
         """Return how far the robot's stop has got; SPARED only if the stop is for all robots, not for named ones."""
         if self.confirmed_s is not None:
             return Progress.CONFIRMED
+        # SPARED: by its capabilities it has no motors, neither that a stop holds nor that it drives.
         if self.estop.has_capabilities and not (self.estop.available or self.estop.drives or self._order.named):
             return Progress.SPARED
         if self.estop.old:
@@ -182,7 +183,7 @@ class RobotStop:
             return []
         self._sent_at, self.next, self._names_due = now, now + REPEAT_S, False
         estop, messages = self.estop, []
-        if not estop.old:
+        if not estop.old:  # old: it is known to have no emergency stop
             messages.append(_message(ESTOP, ESTOP.topic(estop.base), self._order.payload))
         cannot_latch = estop.old or bool(estop.zeros)
         if cannot_latch and not self._script_ended:  # else the script would drive on between two zeros

@@ -153,7 +153,7 @@ def _numeric(setting: Setting, raw: Any) -> int | float:
     number = _finite(setting.key, raw)
     if not is_integer:
         return number
-    if not number.is_integer() or abs(number) >= 1e15:
+    if not number.is_integer() or abs(number) >= 1e15:  # 15 digits, as in a text
         raise error
     return int(raw)
 

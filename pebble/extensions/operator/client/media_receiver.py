@@ -29,10 +29,10 @@ class MediaReceiver:
         self.pictures, self.sounds = RateMeter(), RateMeter()
         self.encoding: dict[Medium, str] = {}  # of the last payload
         self._video, self._audio = VideoDecoder(), SoundDecoder()
-        self.requests: dict[Medium, ViewerRequest] = {}
+        self.requests: dict[Medium, ViewerRequest] = {}  # made by :meth:`request`
         self._transport = transport
         self._subscriptions: list[Subscription] = []
-        self._is_known = threading.Event()
+        self._is_known = threading.Event()  # capabilities have arrived
         self._subscriptions.append(transport.subscribe(CAPABILITIES.topic(base), self._on_capabilities))
 
     def wait_for_capabilities(self, timeout: float) -> None:
@@ -93,6 +93,7 @@ class MediaReceiver:
             request.receive(message, time.monotonic())
 
         subscribe = self._transport.subscribe
+        # The flag is handled at once, as only media take long. Our own requests for it are not to come back.
         self._subscriptions.append(subscribe(request.flag_topic, on_flag, echo=False, direct=True))
         self._subscriptions.append(subscribe(request.media_topic, on_media, qos=QoS.LATEST))
 

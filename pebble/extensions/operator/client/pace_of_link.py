@@ -53,7 +53,7 @@ def pace_of(link: LinkState | None) -> Pace:
     least_hz = 1000 * _LEAST_VALID / level.valid_ms  # at a lower rate the robot may halt between two commands
     hz = min(max(link.drive_hz, least_hz), LEVELS["wide"].drive_hz)
     step_s = 1 / hz - _EARLY_S  # else a command that comes a moment before its slot would be left out
-    # after a long queue a command would come too late: send few until the queue is gone
+    # The robot asks for less than its level's rate: more is on its way than drains. Send few until the queue is gone.
     if link.drive_hz < level.drive_hz and link.queue_ms > _USELESS_MS:
         step_s = min(link.queue_ms / 1000, _LONGEST_S)
     return Pace(

@@ -186,7 +186,7 @@ def _clean(state: EstopState) -> EstopState:
 
 
 def is_of_another(topic: str, base: str) -> bool:
-    """True if ``topic`` belongs to another component.
+    """True if ``topic`` belongs to another component. Topics of fewer than four levels belong to none.
 
     Capabilities may contain any topic, and their publisher may lack the right to publish there: a client that believed
     them would drive another robot.

@@ -33,9 +33,9 @@ class Liveness:
         self.received_at: float | None = None  # monotonic
         self.reported_offline = False
         self.link: LinkLevel = "wide"  # as its bridge measures it
-        self._intervals: deque[float] = deque(maxlen=_HISTORY)
-        self._latencies: deque[float] = deque(maxlen=_HISTORY)
-        self._stamps: deque[int] = deque(maxlen=_STAMPS)
+        self._intervals: deque[float] = deque(maxlen=_HISTORY)  # between the newest heartbeats
+        self._latencies: deque[float] = deque(maxlen=_HISTORY)  # of the newest with a plausible time
+        self._stamps: deque[int] = deque(maxlen=_STAMPS)  # times in the newest, ms of its clock
         self.latency_s: float | None = None  # of the newest heartbeat; None if its clock is wrong
         self._returns: deque[float] = deque(maxlen=2)  # when a heartbeat came after people had been told of a silence
 
@@ -156,7 +156,7 @@ class RobotView:
             self.charging = payload.value
         elif channel is c.AUTONOMY_STATUS:
             self.autonomy = payload
-        else:
+        else:  # a heartbeat
             self._take_announced(message.payload)
             if not message.retain:  # a heartbeat that is retained is no sign of life
                 self.liveness.heartbeat(now, wall - payload.t / 1000, online=payload.online is not False, t=payload.t)
@@ -185,7 +185,7 @@ class RobotView:
     def _note_retained_drive(self, message: Message) -> None:
         """Note whether a drive command that moves the robot is retained.
 
-        A message that is empty and not retained itself removes it.
+        An empty message, which brokers deliver without the retain flag, tells that the retained one was removed.
         """
         if message.retain or not message.payload:
             self.parked = bool(message.payload)
@@ -193,9 +193,9 @@ class RobotView:
                 self.parked = self.parked and codec.decode(c.DRIVE, message.payload).moves
 
     def _keep_for_late_stop(self, message: Message) -> None:
-        """Keep the topic's newest message: an emergency stop that begins later starts with all kept messages.
+        """Keep the topic's newest message: an emergency stop that this program sends later gets all kept ones first.
 
-        Capabilities have a place even after MAX_REMEMBERED states of owners.
+        Capabilities are kept even if there are MAX_REMEMBERED states of owners already.
         """
         has_place = message.topic in self.remembered or message.topic == c.CAPABILITIES.topic(self.base)
         if not message.payload:

@@ -138,7 +138,7 @@ def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
             transport, names, lambda base: base in sender.robots and sender.robots[base].estop.named
         )
         outbox = _Outbox(transport, sender)
-        outbox.publish()
+        outbox.publish()  # at once, before anything else
         report = _Report(sender, outbox)
         try:
             with _heartbeats(target, every=every) as heartbeats, listening(target, transport) as second:
@@ -146,7 +146,7 @@ def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
                 while not sender.finished:
                     for message in heartbeats.take() if heartbeats else ():
                         sender.receive(message, time.monotonic())
-                    outbox.publish()
+                    outbox.publish()  # to robots that were just heard, before the wait
                     _receive(listener, sender, _until_due(sender, has_heartbeats=heartbeats is not None))
                     outbox.publish()
                     report.connection(
@@ -166,9 +166,9 @@ def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
 
 @contextmanager
 def _heartbeats(target: Target, *, every: bool) -> Iterator[Heartbeats | None]:
-    """Open a connection for the heartbeats of all robots, for a stop of all at a broker; otherwise yield None.
+    """Yield a connection for heartbeats if all robots of a broker are to be stopped (``every``), else None.
 
-    With a client id from the config there can be only one connection.
+    It is None, too, with a client id from the config, with which there can be only one connection.
     """
     _, settings, _, _ = resolve(target)
     if not every or not isinstance(settings, MqttSettings) or settings.client_id is not None:
@@ -264,6 +264,7 @@ class _Report:
             _echo(f"there are more than {len(sender.robots)} robots: the others got the stop, NOT CONFIRMED")
 
     def _print(self, *, is_early: bool) -> None:
+        """Print the lines that have changed; ``is_early``: see :func:`_line`."""
         for base, robot in list(self._sender.robots.items()):
             if is_early and robot.driveable is None and robot.progress is Progress.CONFIRMED:
                 continue  # its status may be on its way, and say that no stop reaches the motors

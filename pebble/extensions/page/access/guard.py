@@ -122,7 +122,7 @@ def content_type(headers: Headers) -> str:
 def host_names(settings: WebSettings) -> frozenset[str]:
     """Return the names by which browsers may address the server, besides addresses."""
     names = ["localhost"]
-    # A name may have a port, which is forwarded to the server's own. Host is compared without ports.
+    # A name may come with another port, from which requests are forwarded. Host is compared without ports.
     names += filter(None, map(_without_port, settings.names))
     if not is_loopback(settings.host):
         names.append(settings.host)

@@ -106,7 +106,7 @@ class TerminalDriver:
         clock.echo(clock.ping(now), 1000 * now, now)  # at once: no network is between keys and driver
         view = self._driven.shown(self._tab, now)
         may_request = self.robot.situation(now).published
-        if view.keeps:  # the robot itself decides who drives it: it must have published who does
+        if view.keeps:  # the robot itself decides who drives: nothing is requested before it has published who does
             may_request = self._driven.published is not None
         if self._willing and may_request and not view.by and not view.asking:
             self._take(now, over=False)
@@ -182,7 +182,7 @@ class TerminalDriver:
         view, situation = self._driven.shown(self._tab, now), self.robot.situation(now)
         situation = situation._replace(
             driven=view.by != "" and not view.you,
-            listening=not view.you,  # without control this terminal may not drive, even if no other person does
+            listening=not view.you,  # this terminal has no control, even if no other person has it
             stopping=self.stop is not None and not self.stop.finished,
         )
         if not self._heartbeat:
@@ -191,7 +191,7 @@ class TerminalDriver:
         driver = f"{view.by} ({device}name {'' if view.checked else 'not '}checked)"
         code, stopped = first_reason(situation), self.robot.stopped_by
         why = words(code, self.name, stopped=stopped, driven=driver, script=self.robot.script)
-        if not why and self.robot.parked:
+        if not why and self.robot.parked:  # `Situation` does not know of it
             return PARKED
         return why
 

@@ -269,7 +269,7 @@ class DrivenRobot:
         if now - self._sent_at < pace.step_s:  # a thin link carries fewer commands than the page sends
             return [], ""
         self._sent_at = now
-        drive = self._signed(Drive(x=op.x, z=op.z, y=op.y, valid_ms=WIDE.valid_ms))
+        drive = self._signed(Drive(x=op.x, z=op.z, y=op.y, valid_ms=WIDE.valid_ms))  # on a thin link as `dated` says
         return [Command(self.ref, pace.dated(drive, now, self._key), pace.qos)], ""
 
     def stop(self, now: float) -> list[Command]:
@@ -321,7 +321,7 @@ class DrivenRobot:
         return commands
 
     def _give(self, tab: Tab, client: ControlClient | None, now: float) -> list[Command]:
-        """Give a page control, by its request to the robot or (``client`` None) by this server; halt what moves."""
+        """Give a page control; halt what moves. ``client`` has got control of the robot; None: this server gives it."""
         commands = self._on(Event.GIVEN, now) + tab.interrupt(tab.gesture, now)  # a key held down now moves no robot
         self.tab, self.client, self._given_key = tab, client, "" if client is None else client.decided
         self._idle_from = now
@@ -352,7 +352,7 @@ class DrivenRobot:
     def _has_ended(self, wish: Wish, now: float) -> bool:
         """True if the page wants no control any more, and the robot confirms that or has not answered in time."""
         if not wish.client.done:
-            wish.ended_at = float("inf")
+            wish.ended_at = float("inf")  # it may have asked again
             return False
         wish.ended_at = min(wish.ended_at, now)
         state = self.published

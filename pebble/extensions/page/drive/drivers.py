@@ -180,8 +180,8 @@ class Drivers:
         accepted = True
         for command in commands:
             publish = self._publish_moving if command.drive.moves else self._publish_zero
-            payload = (self._robots.view(command.ref) or RobotView(command.ref)).encode(command.drive)
-            accepted = publish(command, payload, by) and accepted
+            robot = self._robots.view(command.ref) or RobotView(command.ref)  # an unknown one gets the usual form
+            accepted = publish(command, robot.encode(command.drive), by) and accepted
         if self._changed:
             self._robots.mark_drivers(set(self._changed))
             self._changed.clear()

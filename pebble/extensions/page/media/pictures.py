@@ -64,8 +64,9 @@ class MediaHub(Streams[PictureStream]):
         while True:
             await asyncio.sleep(1.0)
             for ref in list(self._robots.components):
-                is_shown = any(not interest.watched for interest in self._robots.interests)
-                if is_shown and not refusal(ref, self._robots.capabilities(ref), "video"):
+                # A page that has no robot open shows the fleet.
+                shows_fleet = any(not interest.watched for interest in self._robots.interests)
+                if shows_fleet and not refusal(ref, self._robots.capabilities(ref), "video"):
                     await self._glimpse(ref)
                     await asyncio.sleep(_TURN_S)
 

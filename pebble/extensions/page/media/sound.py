@@ -41,7 +41,7 @@ class SoundQueue:
 
     def __init__(self) -> None:
         self._queue: deque[bytes] = deque()
-        self._bytes = self._sent = self._received = 0
+        self._bytes = self._sent = self._received = 0  # bytes that wait; packets sent, and received by the page
 
     def offer(self, payload: bytes) -> None:
         self._queue.append(payload)

@@ -105,8 +105,8 @@ class Link:
 class RobotSource:
     """The messages of one robot in an archive, for a player.
 
-    ``begins`` is called before the state at a time is sent, with that time and the picture then. A message
-    received exactly at a time belongs to the state at that time.
+    Before the state at a time is sent, ``begins`` is called with that time and the camera's newest picture at it. A
+    message received exactly at a time belongs to the state at that time.
     """
 
     def __init__(self, archive: Archive, ref: str, begins: Callable[[int, Recorded | None], None]) -> None:

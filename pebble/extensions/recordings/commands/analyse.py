@@ -68,7 +68,7 @@ def analyse(
             indexed = sources(places, scratch, progress)
         for line in indexed.unread:
             typer.echo(f"pebble: {shown(line)}", err=True)
-        if not indexed.unread:
+        if not indexed.unread:  # else a robot may be in what could not be read
             for base in bases:
                 check_name("robot", base, indexed.robots, places)
         traffic = analyse_traffic(

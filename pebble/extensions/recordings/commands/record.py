@@ -101,10 +101,11 @@ def _run(recorder: Recorder, source: Source, where: str, length: str | None) -> 
         except KeyboardInterrupt:
             pass
         if sys.stderr.isatty():
-            typer.echo("", err=True)
+            typer.echo("", err=True)  # ends the line that _serve rewrites
 
 
 def _serve(recorder: Recorder, source: Source, ends_at: float | None) -> None:
+    """Wait until ``ends_at``; report the recorder's state to systemd, to the terminal and as metrics."""
     systemd = SystemdNotifier()
     systemd.ready()
     began = printed = written = time.monotonic()

@@ -71,6 +71,7 @@ class _Export:
     def _add(self, message: Recorded, converted: Converted) -> None:
         protobuf, topic = converted.message, f"{message.channel.topic}/{converted.ending}"
         if topic not in self._channels:
+            # 0, here and below: ``Copy`` numbers channels and messages itself.
             schema = Schema(protobuf.DESCRIPTOR.full_name, "protobuf", self._schemas.descriptors(protobuf))
             self._channels[topic] = Channel(0, topic, "protobuf", {}, schema)
         stamp = time_of(message.payload, message.log_ns, message.publish_ns)

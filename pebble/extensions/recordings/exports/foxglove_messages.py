@@ -72,7 +72,7 @@ class Schemas:
         return getattr(importlib.import_module(f"foxglove_schemas_protobuf.{schema}_pb2"), schema)(**fields)
 
     def descriptors(self, message: Any) -> bytes:
-        """Return the file descriptors of a message, each after those that it imports: a schema in MCAP's terms."""
+        """Return a message's protobuf FileDescriptorSet, each file after its imports: a schema in MCAP's terms."""
         files: dict[str, Any] = {}
 
         def add(file: Any) -> None:
@@ -203,7 +203,7 @@ class Telemetry:
     def _localization(self, _topic: str, payload: bytes) -> Converted | None:
         """Convert the pose of a ROS robot: metres and radians in the frame that it names."""
         pose = codec.plain(c.LOCALIZATION_POSE, payload)
-        value = pose.get("value", pose) if isinstance(pose, dict) else None
+        value = pose.get("value", pose) if isinstance(pose, dict) else None  # wrapped in ``value`` or not
         if not isinstance(value, dict):
             return None
         x, y = _number(value, "x_m"), _number(value, "y_m")
@@ -277,7 +277,7 @@ def as_object(payload: bytes) -> bytes | None:
     """
     payload = codec.trim(payload)
     try:
-        payload.decode()
+        payload.decode()  # raises if it is not UTF-8
         value = msgspec.json.decode(payload)
     except (UnicodeDecodeError, msgspec.DecodeError, RecursionError):
         return None

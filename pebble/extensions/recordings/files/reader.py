@@ -156,7 +156,7 @@ class RecordingFile:
             streams = ((chunk.start_ns, partial(self._unpacked_later, chunk, chooses)) for chunk in chunks)
             yield from in_time_order(streams)
             return
-        expected = 0 if len(chunks) == len(self.chunks) else None  # number of the next message; None: not known
+        expected = 0 if len(chunks) == len(self.chunks) else None  # number of the next message; None: some are skipped
         for chunk in chunks:
             messages, numbers = self._unpacked(chunk, chooses)
             if numbers is not None:
@@ -164,8 +164,8 @@ class RecordingFile:
                 if expected is not None and self.statistics is None:  # without a summary only this gap shows the loss
                     self.damage.missing += max(0, first - expected)
                 expected = last + 1
-            elif expected is not None:
-                expected += chunk.messages  # of a damaged chunk, which is counted already
+            elif expected is not None:  # a damaged chunk: its messages are counted as missing already
+                expected += chunk.messages
             yield from messages
 
     def messages(self, chunk: Chunk) -> list[Recorded]:
@@ -190,6 +190,7 @@ class RecordingFile:
     # -- a finished file
 
     def _open(self) -> None:
+        """Read the header and the summary; without a usable summary look through all records."""
         from mcap.records import Header
 
         begin = self._read(0, len(MAGIC))
@@ -219,8 +220,10 @@ class RecordingFile:
             footer = record_of(tail[: -len(MAGIC)])
             if not isinstance(footer, Footer) or not tail.endswith(MAGIC):
                 return None
-            end = self._read(footer.summary_start or self.size - _TAIL, _LARGEST_SUMMARY)
-            if not footer.summary_crc or zlib.crc32(end[: -len(MAGIC) - _CHECKSUM]) == footer.summary_crc:
+            start = footer.summary_start or self.size - _TAIL  # 0: the footer follows without a summary
+            end = self._read(start, _LARGEST_SUMMARY)
+            has_checksum = footer.summary_crc != 0
+            if not has_checksum or zlib.crc32(end[: -len(MAGIC) - _CHECKSUM]) == footer.summary_crc:
                 self.damage.finished = True
                 return summary_of(end)
         return None
@@ -234,7 +237,7 @@ class RecordingFile:
         if not counted.channel_message_counts.keys() <= summary.channels.keys():
             return False
         for record in (*summary.schemas.values(), *summary.channels.values()):
-            self._name(record)
+            self._declare(record)
         self._metadata = [index.offset for index in summary.metadata_indexes]
         self.chunks, self.statistics = chunks, counted
         return True
@@ -253,7 +256,7 @@ class RecordingFile:
             elif op == Op.METADATA:
                 self._metadata.append(at)
             elif op == Op.CHANNEL:
-                self._name(self._record(at), is_certain=False)  # it is outside of chunks
+                self._declare(self._record(at), is_certain=False)  # outside of chunks no checksum protects it
 
     def _learn(self, chunk: Chunk) -> None:
         """Note the channels that a chunk declares."""
@@ -299,15 +302,15 @@ class RecordingFile:
             if op == Op.MESSAGE:
                 yield data, begin, end
             elif op in (Op.SCHEMA, Op.CHANNEL):
-                self._name(record_of(data[begin - HEAD.size : end]))
+                self._declare(record_of(data[begin - HEAD.size : end]))
 
     def _unpacked_later(self, chunk: Chunk, chooses: Chooses) -> Iterator[Recorded]:
         yield from self._unpacked(chunk, chooses)[0]
 
-    def _name(self, record: McapRecord, *, is_certain: bool = True) -> None:
-        """Note a schema or channel.
+    def _declare(self, record: McapRecord, *, is_certain: bool = True) -> None:
+        """Note a schema or channel. Channels that were noted before keep their schema.
 
-        ``is_certain`` False: it was outside of chunks, where no checksum protects it, and replaces no other.
+        ``is_certain`` False: it was outside of chunks, where no checksum protects it; such a channel replaces no other.
         """
         from mcap.records import Channel as ChannelRecord
         from mcap.records import Schema as SchemaRecord

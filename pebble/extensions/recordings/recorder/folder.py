@@ -102,7 +102,7 @@ class Folder:
             if not (root / LOCK).exists():
                 return False
             try:
-                with _locked(root / LOCK, "") as is_locked:
+                with _locked(root / LOCK, "") as is_locked:  # "": its error is caught here
                     return not is_locked
             except RecordingError:
                 return True

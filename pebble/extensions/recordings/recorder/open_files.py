@@ -23,6 +23,7 @@ class RetainedValues:
 
         Where the transport does not tell that, note each message on a topic that has a retained value already.
         """
+        # ``item.retain``: it was published to be retained. ``item.retained``: it came as an old value.
         key = f"{item.source} {item.topic}"
         stored = self._values.get(key)
         if item.retained and stored is not None and not stored.retained:

@@ -36,7 +36,7 @@ class Source:
         self._settings = settings
         self._is_modern = True  # the broker knows MQTT 5, as far as we know
         self._lost_at = 0  # nanoseconds since 1970; 0: connected, or never was
-        self._losses: dict[str, int] = {}
+        self._losses: dict[str, int] = {}  # messages that the transport dropped, by reason, as noted last
         self._fetching: _RetainedFetch | None = None
         self._wants_fetch = self._was_connected = False
         self._transport = self._make()
@@ -66,6 +66,7 @@ class Source:
             self._transport.close()
             self._is_modern = False
             self._transport = self._make()
+            self._losses.clear()  # the new one counts from zero
             self._open(0.0)
         fetching = self._fetching
         if fetching is not None and (fetching.is_done or self._wants_fetch):
@@ -103,6 +104,7 @@ class Source:
     # -- the transport's threads
 
     def _watch(self, state: State) -> None:
+        """Record that the connection was made or lost; a new one brings all retained messages again."""
         now_ns = self._recorder.clock.now()
         if state is State.CONNECTED:
             if self._lost_at:
@@ -119,6 +121,7 @@ class Source:
     def _receive(self, message: Message) -> None:
         if message.topic.startswith(self._ignored):
             return
+        # With as_published the flag says nothing, but the broker was told to send no old values, see _make.
         is_live = self._transport.as_published or not message.retain
         if is_live:
             self._recorder.receive(

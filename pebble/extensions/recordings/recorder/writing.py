@@ -60,9 +60,9 @@ class Writing:
         self._intake = intake
         self._files = OpenFiles(self._folder, about, background.watch)
         self._finisher = Finisher(background, self._intake.note, self._note_finished)
-        self._blocked: _Blocked | None = None
+        self._blocked: _Blocked | None = None  # why nothing can be written now
         self._lacking: list[Item] = []  # what no file has taken; bounded: a second of messages
-        self._noted_drops = 0
+        self._noted_drops = 0  # messages that were dropped, as recorded last
         self._changed = False  # files were finished since the folder was listed
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
 
@@ -124,7 +124,7 @@ class Writing:
         try:
             file.add(item, at_ns)
         except OSError as error:
-            self._fail(lane, error)  # it keeps this item, which is among those that the file has not written
+            self._fail(lane, error)  # this item is among the unwritten ones, which go into the next file
 
     def flush(self) -> None:
         """Write all added messages to the files."""
@@ -266,6 +266,7 @@ class Writing:
         log.warning("%s was removed, or is on another disk now: recording into what is there", self._folder.root)
 
     def _make_room(self, disk: Disk, due: Due, now_s: float) -> None:
+        """Delete the files that leave too little room and, one at a time, those that are kept for too long."""
         entries = self._folder.entries()
         for entry in surplus(entries, self._options, disk):
             self._delete(entry.path, entry.size)

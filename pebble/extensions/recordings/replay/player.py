@@ -77,7 +77,7 @@ class BusOutput:
         if not self._publish(outgoing.message):
             return False
         self.sent += 1
-        if outgoing.moves is not None:
+        if outgoing.moves is not None:  # it is a drive command
             self._moved.pop(outgoing.message.topic, None)
             if outgoing.moves:
                 self._moved[outgoing.message.topic] = None
@@ -98,7 +98,7 @@ class Reading:
 
     def __init__(self, source: Source, publishes: Chooses, until_ns: int) -> None:
         self.next: Recorded | None = None
-        self.state: list[Recorded] = []  # to be sent before the next message, the last one first
+        self.state: list[Recorded] = []  # to be sent before the next message; in reverse, the last entry first
         self.skipped = 0
         self._source, self._publishes, self._until_ns = source, publishes, until_ns
         self._messages: Iterator[Recorded] = iter(())
@@ -141,7 +141,7 @@ class Player:
         """Prepare to play. ``wait`` waits up to so many seconds; ``now`` returns seconds and never goes back.
 
         ``stays``: pause at the end instead of returning, and accept any time as a position, also before the first
-        message. A pause of the recording is shortened to ``longest_gap_ns``.
+        message. A pause of the recording that is longer than ``longest_gap_ns`` is left out.
         """
         self.paused, self.ended = paused, False
         self.at_end = False  # it is paused there
@@ -150,8 +150,8 @@ class Player:
         self._pace = Pace(now, speed=speed)
         self._now, self._wait = now, wait
         self._since_ns, self._loop, self._stays, self._longest_gap_ns = since_ns, loop, stays, longest_gap_ns
-        self._begins_ns = 0  # time of the first message
-        self._waited = 0.0  # when ``wait`` returned last
+        self._begins_ns = 0  # time of the first message; 0: there is none, or the player stays at the end
+        self._waited_at = 0.0  # when ``wait`` returned last
 
     @property
     def sent(self) -> int:
@@ -232,10 +232,10 @@ class Player:
     def _step(self) -> None:
         """Wait, send one message, or end: what is due now."""
         now, reading = self._now(), self._reading
-        if now - self._waited > _TICK_S:  # also if messages are due all the time, ``wait`` may pause or stop this
+        if now - self._waited_at > _TICK_S:  # also if messages are due all the time, ``wait`` may pause or stop this
             self._pass(0.0)
-        elif reading.state:
-            if self._send(reading.state[-1], self._pace.from_ns):  # the last one comes first
+        elif reading.state:  # also while paused, so that a move is shown at once
+            if self._send(reading.state[-1], self._pace.from_ns):  # the list is in reverse: its last entry is due first
                 reading.state.pop()
         elif self.paused:
             self._output.halt()
@@ -249,11 +249,11 @@ class Player:
         """Send the next message if it is due, else wait for a moment."""
         due_s = self._pace.due_s(message.log_ns, now)
         if message.log_ns - self._pace.reached_ns > self._longest_gap_ns:
-            self._pace.go_on_from(message.log_ns)
+            self._pace.go_on_from(message.log_ns)  # leave out the rest of a long pause
         elif due_s > _NOW_S:
             self._pass(min(due_s, _TICK_S))
             return
-        if due_s < -_LATE_S:
+        if due_s < -_LATE_S:  # too late to catch up
             self._pace.go_on_from(message.log_ns)
         if self._send(message, message.log_ns):
             self._reading.advance()
@@ -267,7 +267,7 @@ class Player:
 
     def _pass(self, seconds: float) -> None:
         self._wait(seconds)
-        self._waited = self._now()
+        self._waited_at = self._now()
 
     def _end(self) -> None:
         self._output.halt()

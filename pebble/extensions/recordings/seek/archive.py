@@ -41,8 +41,8 @@ class Archive:
 
     def __init__(self, *places: Path) -> None:
         self._places = places
-        self._named: list[_Named] = []
-        self._listed_at = float("-inf")
+        self._named: list[_Named] = []  # the files in these places
+        self._listed_at = float("-inf")  # when they were last listed
         self._open: dict[Path, RecordingFile] = {}
         self._failed: dict[Path, str] = {}  # why a file cannot be opened
 
@@ -123,7 +123,8 @@ class Archive:
         for named in self._list():
             if named.lane.startswith(MEDIA) and named.lane not in media_lanes:
                 continue
-            if named.begins_ns and not since_ns - _LONGEST_FILE_NS <= named.begins_ns < until_ns:
+            may_overlap = since_ns - _LONGEST_FILE_NS <= named.begins_ns < until_ns
+            if named.begins_ns and not may_overlap:  # 0: the name does not tell when it begins
                 continue
             file = self._opened(named.path)
             if file is None or not file.chunks or file.first_ns >= until_ns or file.last_ns < since_ns:
@@ -167,6 +168,8 @@ class Archive:
             file.refresh()
         except (PebbleError, OSError) as error:
             self._failed[path] = str(error).removeprefix(f"{path}: ")
+            if file is not None:
+                file.close()
             return None
         self._failed.pop(path, None)
         self._open[path] = file  # the last one used is the last one closed
@@ -235,6 +238,7 @@ def _is_of(channel: Channel, robot: str) -> bool:
 
 
 def _named(path: Path) -> _Named:
+    """Return the file with the facts that its name tells; a file with another name may hold anything."""
     match = NAME.fullmatch(path.name)
     if match is None:
         return _Named(path, "", 0)

@@ -165,7 +165,7 @@ class _Rows:
         activity = self._activities.get(channel)
         if activity is None:
             activity = self._declare(message.channel)
-        stamp = message.publish_ns if message.publish_ns <= _LATEST_NS else 0
+        stamp = message.publish_ns if message.publish_ns <= _LATEST_NS else 0  # later ones cannot be stored
         medium, online = 0, -1  # of no media, and no heartbeat
         if payload.startswith(PBAT):
             medium = SOUND
@@ -188,7 +188,7 @@ class _Rows:
             self._heartbeats.add(channel.id)
         metadata = channel.metadata
         qos = {"1": 1, "2": 2}.get(metadata.get("qos", ""), 0)
-        flags = [metadata.get(name, "0") not in ("", "0") for name in ("retain", "retained")]
+        flags = [metadata.get(name, "0") not in ("", "0") for name in ("retain", "retained")]  # see COLUMNS
         self._connection.execute(
             "INSERT INTO channels VALUES (?, ?, ?, ?, ?, ?, ?)", [channel.id, robot, direction, metric, qos, *flags]
         )

@@ -73,7 +73,7 @@ def timeline(
             return Timeline(since_ns // 10**6, gaps=gaps)
         queries = RobotQueries(connection, robot)
         queries.load(indexed.indexes, since_ns, until_ns)
-        day = _stepped(connection)
+        day = _day_of_activity(connection)
         day.gaps = gaps
         day.sessions = [Stretch(1000 * session.since_s, 1000 * session.until_s) for session in queries.sessions()]
         interval_ms = queries.interval_ms()
@@ -82,7 +82,8 @@ def timeline(
     return day
 
 
-def _stepped(connection: Any) -> Timeline:
+def _day_of_activity(connection: Any) -> Timeline:
+    """Return the day with its activity alone, from the first step with a message to the last."""
     activity = dict(connection.execute(_ACTIVITY).fetchall())
     if not activity:
         return Timeline(0)

@@ -101,7 +101,7 @@ class Follower:
     def __init__(self, settings: FollowSettings) -> None:
         self.settings = settings
         self._pulses = Pulses()
-        self._seen_at = self._side_since = float("-inf")
+        self._seen_at = self._side_since = float("-inf")  # when the tag was last seen; since when ``_side`` is so
         self._side = 1.0  # the side on which the tag was seen last, and to which the search turns: right is positive
         self._last = Command()
         self._holding = False  # the wanted distance is reached
@@ -112,6 +112,7 @@ class Follower:
         return self._last
 
     def _with_tag(self, now: float, place: Place) -> Command:
+        """Return a command for a visible tag: turn to it if it is outside of the cone, else drive to the distance."""
         self._seen_at = self._side_since = now
         self._near = place.distance_m < self.settings.target_distance_m + _NEAR_M
         self._side = math.copysign(1.0, place.angle_rad)
@@ -160,11 +161,12 @@ class Follower:
         return self._search(now)
 
     def _search(self, now: float) -> Command:
+        """Turn to the side where the tag was seen last, and after ``search_reverse_after_s`` to the other one."""
         settings = self.settings
         reverse_s = settings.search_reverse_after_s
         if reverse_s > 0.0 and now - self._side_since > reverse_s:
             self._side = -self._side
             self._side_since = now
-        # A pulse lasts for one or two commands: with more power one could turn past all that the camera sees.
+        # A pulse lasts for one or two commands: with more power it could turn the robot past more than its camera sees.
         x = self._pulses.turn(self._side * settings.turn_power, settings.turn_pulse_s, settings.search_pause_s, now)
         return Command(x, 0.0, "search")

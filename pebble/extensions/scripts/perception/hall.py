@@ -128,8 +128,8 @@ class PhaseTracker:
     def _predict(self, power: float) -> float:
         """Return the phase that this sample should add: by the power, and by the measured speed if that agrees.
 
-        If the expected direction changes, the phase may go back from now on: its limit, the farthest phase reached,
-        is set to the present one.
+        If the expected direction changes, the phase may go back from now on: the farthest phase reached, behind which
+        it must not go, is set to the present one.
         """
         before = self._expected
         mean_power = (self._power + power) / 2  # a command comes between two samples
@@ -258,7 +258,10 @@ class HallWheel:
         counts.rad_in_any_direction += abs(added)
 
     def _sign_of_second(self, samples: list[HallSample]) -> int:
-        """Return the factor that lets the second sensor's level agree with the commands: 1 or −1; 0 if neither does."""
+        """Return the factor that lets the second sensor's level agree with the commands: 1 or −1; 0 if neither does.
+
+        Also 0 after less motion than half a wave, which shows too little.
+        """
         if not self._second.swings or self._second.extrema < 1:
             return 0
         agreed = 0.0  # the motion in the commanded direction; against it: negative
@@ -268,6 +271,7 @@ class HallWheel:
         for sample in samples:
             if sample.quadrature is None:
                 return 0
+            # With the factor 1 the first level is the sine of the phase, and the second one, behind it, −cosine.
             phase = math.atan2(self._range.level(sample.value), -self._second.level(sample.quadrature))
             if sample.direction != last_direction:
                 total, since_change = total + abs(since_change), 0.0

@@ -64,8 +64,9 @@ class OdomFollower:
             self._planned_at = now
 
     def step(self, now: float, pose: Pose | None) -> Command:
+        """Return the command: by the camera if the tag is in sight, else by odometry to its place, else to find it."""
         place = self._place if now - self._seen_at <= self.settings.tag_timeout_s else None
-        vision = self._vision.step(now, place)
+        vision = self._vision.step(now, place)  # it waits and searches on, even while odometry leads
         if place is not None:
             return vision
         if self._goal is not None and pose is not None:

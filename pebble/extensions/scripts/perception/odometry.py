@@ -69,7 +69,7 @@ class OdometrySettings(Struct, frozen=True, kw_only=True):
 
 
 def calibrated(settings: OdometrySettings, calibration: Calibration) -> OdometrySettings:
-    """Return the settings with measured values in place of those that have their defaults."""
+    """Return the settings with the measured values, but keep each value that the user has changed from its default."""
     default = OdometrySettings()
     if settings.step_mm == default.step_mm:
         steps = {"left_mm_per_event": calibration.left_step_mm, "right_mm_per_event": calibration.right_step_mm}
@@ -176,9 +176,9 @@ class Odometry:
         self._directions = Directions(now)
         self._left, self._right = map(_Wheel, settings.step_mm)
         self._gyro = GyroHeading()
-        self._heading_source = "wheels"
-        self._samples = self._published = 0
-        self._powered = False
+        self._heading_source = "wheels"  # of the newest turn; else "gyro"
+        self._samples = self._published = 0  # samples of the hall sensors, and calls of :meth:`value`
+        self._powered = False  # a motor had power at the newest sample
 
     def moving(self, now: float) -> bool:
         return now - max(self._left.turned_at, self._right.turned_at) < _MOVING_S
@@ -196,10 +196,11 @@ class Odometry:
         """Add a sample of the hall sensors."""
         self._samples += 1
         settings, (left, right) = self._settings, self._directions.at(now)
+        # Only the left wheel may have a second sensor.
         left_second = None if settings.second_channel == "none" else getattr(values, settings.second_channel)
         left_value, right_value = getattr(values, settings.left_channel), getattr(values, settings.right_channel)
         left_mm = self._left.update(HallSample(left_value, left_second, left.power, left.direction), now)
-        right_mm = self._right.update(HallSample(right_value, None, right.power, right.direction), now)
+        right_mm = self._right.update(HallSample(right_value, None, right.power, right.direction), now)  # one sensor
         self._powered = left.power != 0.0 or right.power != 0.0
         self._move(left_mm, right_mm, now)
 
@@ -213,8 +214,8 @@ class Odometry:
         part.turn_rad += turn if measured is None else measured
         self.pose = part.end(self._base)
         is_ready = self._left.hall.ready and self._right.hall.ready
-        if is_ready:  # the part will not be corrected any more
-            if self.moving(now) or not self._was_ready:  # a distance at rest is noise, unless a warm-up ends now
+        if is_ready:  # no warm-up of a sensor can correct the part any more
+            if self.moving(now) or not self._was_ready:  # at rest it is noise, unless a warm-up has just ended
                 self.distance_mm += abs(part.ahead_mm)
             self._base, self._part = self.pose, _Part()
         self._was_ready = is_ready

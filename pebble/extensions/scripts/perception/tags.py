@@ -115,6 +115,7 @@ class TagFinder:
 
 
 def _checked(picture: Any) -> Any:
+    """Return a picture in the form that OpenCV takes. Raises PebbleError for anything else."""
     if not isinstance(picture, np.ndarray):
         raise PebbleError(f"{_PICTURE}, not {type(picture).__name__}")
     if picture.dtype != np.uint8:

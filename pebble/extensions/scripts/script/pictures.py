@@ -20,8 +20,8 @@ class Pictures:
         self._run_dir = run_dir
         self._changing = threading.Lock()
         self._cameras: WeakSet[Camera] = WeakSet()
-        self._polled: Camera | None = None
-        self._last: Picture | None = None
+        self._polled: Camera | None = None  # the camera of :meth:`newest`
+        self._last: Picture | None = None  # its newest picture, unless that is too old
         self._closed = False
 
     def every(self, **options: Any) -> Iterator[Picture]:

@@ -215,10 +215,10 @@ class Robot:
     # -- its end
 
     def end(self, why: str, exit_code: int = 0) -> None:
-        """Publish the final stop and close the cameras; every later call raises Stopped. From any thread."""
-        if os.getpid() != self._pid:
+        """Publish the final zero and close the cameras; every later call raises Stopped. From any thread."""
+        if os.getpid() != self._pid:  # a forked copy of the script's process
             return
-        if not self._stopped.is_set():
+        if not self._stopped.is_set():  # the first end decides
             self._exit_code = exit_code
         self._stopped.set()
         self._wheels.end(why)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import threading
@@ -167,13 +168,18 @@ def test_frames_are_born_in_the_segment_where_that_is_possible_and_stamped(strea
 # -- when the device fails
 
 
-def test_a_device_that_is_not_there_is_tried_again_ever_more_slowly(streams: Streams) -> None:
+def test_a_device_that_is_not_there_is_tried_again_ever_more_slowly(
+    streams: Streams, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
     writer, device = Remembering(), Device(refuses=3)
     stream = streams(writer, device)
     assert until(lambda: report(stream).last_error == "not there")
     assert until(lambda: report(stream).running)
     assert device.openings == 4
     assert report(stream).restarts == 3
+    assert "not there; it is opened again in 0.2 s" in caplog.text, "the third time"
+    assert "as it should be again" not in caplog.text, "its frames had no problem"
 
 
 @pytest.mark.parametrize("error", [DeviceError("unplugged"), ValueError("of a library")])

@@ -28,7 +28,7 @@ from pebble.extensions.media.speech import Speech
 from pebble.services.av_daemon import alsa, capture_program, sources
 from pebble.services.av_daemon.alsa import AlsaMicrophone
 from pebble.services.av_daemon.capture_program import CaptureProgram
-from pebble.services.av_daemon.health import Health
+from pebble.services.av_daemon.health import Asked, Health
 from pebble.services.av_daemon.jpeg_splitter import JpegSplitter
 from pebble.services.av_daemon.libcamera import LibcameraCamera
 from pebble.services.av_daemon.source import Capture, Source
@@ -196,6 +196,11 @@ class TestOpenCv:
         with pytest.raises(DeviceError, match="gives no picture"):
             opened[0].grab()
 
+    def test_only_a_camera_of_this_machine_is_asked_for_a_rate_and_a_size(self) -> None:
+        devices = ("0", "/dev/video2", "film.avi", "rtsp://127.0.0.1/door")
+        asked = [sources.asked_of_camera(options(video={**SMALL, "device": device}).video) for device in devices]
+        assert asked == [Asked(30, 320, 240), Asked(30, 320, 240), Asked(), Asked()]
+
     @pytest.mark.parametrize("device", ["99", "rtsp://someone:s3cret@127.0.0.1:1/door?key=s3cret"])
     def test_what_is_not_there_is_an_error_without_a_password(self, device: str) -> None:
         with pytest.raises(DeviceError, match="cannot open") as raised:
@@ -236,6 +241,8 @@ class TestRotation:
         coded = cv2.imencode(".jpg", scene)[1].tobytes()
         camera = Rotated(Still(FrameInfo(format="mjpeg", width=320, height=240), coded, broken=3), 180)
         capture = camera.grab()
+        turned = options(video={**SMALL, "backend": "libcamera", "rotate_degrees": 180})
+        assert capture.size == sources.picture_bytes(turned)
         data = capture.pixels(np.empty(capture.size, np.uint8))
         assert (capture.info.format, capture.info.stride, capture.skipped) == ("bgr24", 960, 3)
         assert read_counter(np.rot90(picture(data, capture.info), 2)) == 77

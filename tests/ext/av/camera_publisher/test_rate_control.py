@@ -176,6 +176,16 @@ class TestSendWindow:
         queue.sent(1000, 1.0)
         assert [frame.took_s for frame in queue.poll(0, 0.2, 1.2 + real_s)] == [pytest.approx(counted_s, abs=1e-6)]
 
+    def test_what_arrives_after_a_long_way_is_not_held_back(self) -> None:
+        queue = SendWindow()
+        queue.poll(0, 0.3, 0.9)
+        for now in (1.0, 1.01):
+            queue.sent(1000, now)
+        assert [len(queue.poll(waiting, 0.3, now)) for waiting, now in ((2000, 1.31), (0, 1.32))] == [0, 2]
+        queue.sent(1000, 2.0)
+        assert not queue.full(0.3, 2.4), "one more shows whether this one is held back"
+        assert [frame.took_s for frame in queue.poll(0, 0.3, 2.4)] == [pytest.approx(0.1)]
+
     def test_a_transport_that_measures_nothing_never_holds_anything_back(self) -> None:
         queue = SendWindow()
         for number in range(100):
@@ -283,7 +293,7 @@ def test_messages_are_acknowledged_in_order() -> None:
     assert [message.at for message in messages.acknowledge(3 * 650)] == [number / 10 for number in range(7)]
     assert messages.age_s(1.0) == pytest.approx(0.3)
     assert len(messages) == 3
-    assert len(messages.acknowledge(20)) == 3, "a ping is no message"
+    assert len(messages.acknowledge(60)) == 3, "pings are no message"
     assert (messages.oldest, messages.age_s(1.0)) == (None, 0)
     messages.sent(600, 2.0)
     messages.clear()

@@ -224,7 +224,7 @@ def test_what_settings_and_rules_of_mosquitto_take_away(
     are_rules = lines.startswith("topic ")
     broker = Broker(tmp_path, f"acl_file {tmp_path / 'acl'}" if are_rules else lines)
     finding = found(broker.port, name)
-    if finding.state is not level:  # a busy machine can hide what a broker holds back for 40 ms
+    if "nodelay" in lines and finding.state is not level:  # a busy machine can hide what it holds back for 40 ms
         finding = found(broker.port, name)
     broker.stop()
     assert (finding.state, words in finding.text) == (level, True), finding

@@ -12,10 +12,14 @@ from pathlib import Path
 
 import pytest
 
+from pebble.config import parse
 from pebble.extensions.recordings.files.recorded import Recorded
+from pebble.services.recorder.service import RobotRecorder
 from pebble.transports import Message, MqttSettings, QoS, Transport, create
+from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.commands.command_line import Run, program
 from tests.ext.recordings.recorder.test_recorder import events, payloads, recorded
+from tests.kit.robot import Running
 from tests.support import WAIT_S, AmqttBroker, Broker, until
 
 GOOB = "pebble/robots/goob"
@@ -160,3 +164,12 @@ def test_mistakes_are_one_line(
     assert run("record", *arguments) != 0
     assert problem in run.err
     assert len(run.err.strip().splitlines()) == 1
+
+
+def test_a_robot_without_a_remote_broker_cannot_record_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "nice", lambda _: 0)
+    section = {"enabled": True, "folder": str(tmp_path), "remote": True}
+    config = parse({"services": {"recorder": section}, "robot": {"id": "goob"}}, folder=tmp_path, env={})
+    running = Running(RobotRecorder(config, MemoryTransport("recorder", MemoryHub())))
+    assert until(lambda: not running.alive)
+    assert str(running.error) == "services.recorder.remote: needs services.mqtt_bridge.remote_mqtt.host"

@@ -66,7 +66,7 @@ class TrialOperator:
         self._controls = create("mqtt", "pebble-impair-controls", settings)
         self._media = create("mqtt", "pebble-impair-media", settings)
         self._driver = ScriptedOperator(RobotView(base), self._publish, by="bench")
-        self._number = 0
+        self._number = 0  # of the newest command
         self._commands: list[Command] = []
         self._heartbeats: list[Arrival] = []
         self._ready = False  # all services
@@ -82,14 +82,14 @@ class TrialOperator:
         self._subscribe(STATUS, self._on_status)
         if not _wait(lambda: self._ready and len(self._heartbeats) > 1, _UP_S):
             raise PebbleError(f"the robot is not ready after {_UP_S:.0f} s")
-        return Report()
+        return Report()  # an empty one: it is ready
 
     def recover(self) -> Report:
         """Wait until no old messages arrive any more. Raises PebbleError if the robot does not recover."""
         _pause(self._over_at + self._plan.quiet_s - time.monotonic())
         if not _wait(self._is_fresh, _STARTUP_S):
             raise PebbleError(f"no fresh heartbeat {_STARTUP_S:.0f} s after the network was restored")
-        return Report()
+        return Report()  # an empty one: it has recovered
 
     def run_trial(self) -> Report:
         """Drive, watch and listen as planned; return what was measured."""

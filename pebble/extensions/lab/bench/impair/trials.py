@@ -117,7 +117,7 @@ class ImpairedRobot:
     robot: Robot
     remote: Program  # its broker
     operator: Worker
-    limit_s: float  # for its operator's next report; the limits of that are shorter
+    limit_s: float  # for the operator's next report; the operator's own limits are shorter
 
     def report(self) -> Report:
         """Return the operator's next report. Raises PebbleError for a problem, a timeout, or an ended process."""

@@ -21,7 +21,7 @@ class Console:
         self.interrupt = 3
         self.reading = True
         self.lost = 0  # bytes
-        self._pause, self._wait = pause, wait
+        self._pause, self._wait = pause, wait  # the board's: for some seconds, and until there is input
         self.typed = bytearray()
         self._output = bytearray()
         self.is_interrupted = False

@@ -69,7 +69,7 @@ class SoftTimers:
         self._busy = False
 
     def wait(self, longest_s: float) -> None:
-        """Wait until the next timer has run, but at most ``longest_s``."""
+        """Wait until the next timer has run, but at most ``longest_s``; only while timers are :attr:`running`."""
         now = self._clock.now()
         until_due_s = min(self._due.values()) - now
         self._clock.sleep(max(0.0, min(until_due_s, longest_s)))

@@ -40,12 +40,12 @@ class Renderer:
         self._width, self._height = width, height
         self._focal = width / 2 / math.tan(math.radians(world.camera.hfov_deg / 2))
         self._middle = ((width - 1) / 2, (height - 1) / 2)
-        self._horizon = math.floor(self._middle[1]) + 1
+        self._horizon = math.floor(self._middle[1]) + 1  # the first row of the ground
         self._floor, self._floor_to_world = _floor(world)
         self._background = np.full((height, width, 3), _SKY, np.uint8)
         self._background[self._horizon :] = _GROUND
         self._noise = _noise(width, height, world.camera.noise) if world.camera.noise else None
-        self._count = 0
+        self._count = 0  # of rendered pictures: each has another part of the noise
 
     def render(self, tracks: Mapping[str, Track], ns: int, out: Image) -> None:
         """Draw the camera's picture at ``ns`` into ``out``, of shape (height, width, 3), with the camera's faults."""
@@ -198,7 +198,7 @@ class Renderer:
 
     def _draw_floor(self, me: RobotPose, out: Image) -> None:
         sine, cosine, height = math.sin(me.heading), math.cos(me.heading), self._lens.height_m
-        to_camera = np.array(
+        to_camera = np.array(  # from (x, y, 1) on the floor to (right, down, ahead) of the camera
             [
                 [sine, -cosine, -sine * me.x + cosine * me.y],
                 [0.0, 0.0, height],
@@ -252,6 +252,7 @@ def _floor(world: World) -> tuple[Image, _Floats]:
     width = max(room.x_max - room.x_min, room.y_max - room.y_min)
     tiles = max(2, min(64, round(width / _TILE_M)))
     checkers = np.indices((tiles, tiles)).sum(axis=0) % 2
+    # Two shades of grey in turn, and each tile a little lighter by chance.
     shades = 120 + 26 * checkers + 20 * noise(7, tiles * tiles).reshape(tiles, tiles)
     picture = cv2.resize(shades.astype(np.uint8), (_FLOOR_PX, _FLOOR_PX), interpolation=cv2.INTER_NEAREST)
     scale = width / _FLOOR_PX

@@ -247,6 +247,7 @@ def _check_robots(robots: Mapping[str, Start], notes: Notes) -> None:
 
 
 def _check_places(world: World, notes: Notes) -> None:
+    """Note robots that stand outside the room or in a wall."""
     for name, place in world.robots.items():
         if world.room is not None and not world.room.holds(place.x, place.y):
             notes.problem(("robots", name), f"stands outside the room, at {place.x:g}, {place.y:g}")

@@ -54,7 +54,7 @@ class ViewerQueue:
         self._queue: deque[Frame] = deque()
         self._under_way: dict[int, tuple[float, Frame]] = {}  # by number: when it was sent, and the frame
         self._undecodable: set[str] = set()  # encodings that the page could not decode after all
-        self._waiting_since = now
+        self._waiting_since = now  # for a key frame
         self._retry_at = 0.0  # when a rescued page gets the robot's own pictures again
 
     def offer(self, frame: Frame) -> None:

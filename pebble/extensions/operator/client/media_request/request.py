@@ -47,7 +47,7 @@ class ViewerRequest:
         self._began_at = self._sent_at = self._received_at = self._keyframe_at = float("-inf")
 
     def check(self, encoding: str | None) -> None:
-        """Raise PebbleError if the robot does not offer the medium in ``encoding``, or (None) at all."""
+        """Raise PebbleError unless the robot offers the medium, and in ``encoding`` if that is not None."""
         if not (self.section.get("available") and self.section.get("controls")):
             raise PebbleError(f"{self._base} offers no {self._medium}")
         listed = self._encodings()

@@ -74,7 +74,10 @@ def main(robot: Robot, options: OdometrySettings) -> None:
 
 
 def tuned(robot: Robot, options: OdometrySettings) -> OdometrySettings:
-    """Return the settings with the calibration in the config's folder, else, if wanted, the original's track width."""
+    """Return the settings with the calibration in the config's folder.
+
+    Without it, ``use_tune_state`` takes the track width from the tuning program of the original Pebble.
+    """
     try:
         raw = (robot.config.folder / CALIBRATION).read_bytes()
         return calibrated(options, decode(raw, type=Calibration))

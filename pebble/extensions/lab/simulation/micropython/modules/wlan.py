@@ -93,7 +93,8 @@ class Wlan:
 
 def network_module(radio: Radio) -> SimpleNamespace:
     """Return the module ``network`` of one board, with ``radio`` as its station. A board is no access point."""
-    interfaces = {Wlan.IF_STA: Wlan(radio), Wlan.IF_AP: Wlan(Radio(lambda: 0.0, radio.platform))}
+    never_joins = Radio(lambda: 0.0, radio.platform)  # its clock stands still
+    interfaces = {Wlan.IF_STA: Wlan(radio), Wlan.IF_AP: Wlan(never_joins)}
 
     def wlan(interface: int = Wlan.IF_STA) -> Wlan:
         return interfaces[interface]
