@@ -387,7 +387,10 @@ class MqttBridge(ForwardingService):
 
     def _follow_owner(self, owner: str, payload: bytes) -> None:
         with suppress(PayloadError):
-            self._passed_stops.follow(owner, codec.decode(c.ESTOP_STATE, payload) if payload else None)
+            state = codec.decode(c.ESTOP_STATE, payload) if payload else None
+            self._passed_stops.follow(owner, state)
+            if state is not None:
+                self._observers.estop(owner, state)
 
     def _has_passed(self, message: Message) -> bool:
         """True if the stops' own connection has passed this stop on already. Otherwise remembers it."""

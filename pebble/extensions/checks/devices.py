@@ -26,8 +26,8 @@ def device(path: Path, what: str, key: str, names: Path) -> CheckResult:
     such as by-id/.
     """
     if not path.exists():
-        links = [link for link in names.glob("by-id/*") if not _METADATA.search(link.name)]
-        fix = f"ls -l {names / 'by-id'}/" if len(links) != 1 else f"set {key} to {links[0]}"
+        links = sorted(str(link) for link in names.glob("by-id/*") if not _METADATA.search(link.name))
+        fix = f"set {key} to {' or '.join(links)}" if links else f"plug it in, then: ls {names}/by-id/*; and set {key}"
         return failed(f"{path} does not exist: is {what} plugged in?", fix)
     if not os.access(path, os.R_OK | os.W_OK):
         fix = f"sudo usermod -aG $(stat -c %G {path}) $USER, then log in again"

@@ -32,7 +32,7 @@ from pebble.contract import (
     codec,
 )
 from pebble.contract.names import NO_ACCOUNT
-from pebble.contract.payloads import ControlState, EstopCommand, LightsSolid, Switch
+from pebble.contract.payloads import ControlState, EstopCommand, EstopState, LightsSolid, Switch
 from pebble.errors import PayloadError
 from pebble.extensions.fleet.row_writer import DIFFERENT, OF_STRANGERS, WINDOW_S, Row, RowWriter
 from pebble.forwarding.observer import ROBOT, Observer
@@ -78,6 +78,8 @@ class Audit(Observer):
         self._level = config.security.level
         self._writer, self._clock = RowWriter(self._append, clock), clock
         self._holder: ControlState | None = None  # None: not known yet
+        self._owners, self._awaited = config.motor_owners, set[str]()  # those that have not answered the newest reset
+        self._refusals = dict[str, str | None]()  # by owner: why it has refused its last reset, if it has
         self._stops = deque[tuple[str, str]](maxlen=_STOPS)  # those that have a row: name and sender
         self._lights = dict[tuple[str, bool], float]()  # when each sender last sent lights, on or off
 
@@ -110,6 +112,8 @@ class Audit(Observer):
                 most_different = OF_STRANGERS if channel in _MILD else DIFFERENT  # in a minute, see RowWriter.add
                 if row and not self._noted_before(row, who):
                     self.note(who=who, most=most_different, **_place(by), **row)
+                if channel is ESTOP_RESET:
+                    self._awaited.update(self._owners)
             else:
                 on = bool(payload) and bool(codec.decode(channel, payload))
                 if on or channel.kind is Kind.FLAG:  # an action that is not "on" does nothing
@@ -132,6 +136,15 @@ class Audit(Observer):
             if holder.key:
                 who = holder.by if holder.named and holder.by else f"{holder.by}{_UNCHECKED}"
                 self.note(what, who, id=holder.id, device=holder.device)
+
+    def estop(self, owner: str, state: EstopState) -> None:
+        """Add a row if the owner has refused a reset; its state shows only why it has refused the last one."""
+        why, before = state.reset_refused, self._refusals.get(owner, state.reset_refused)
+        is_answer, is_of_another = owner in self._awaited, why == "boot" and len(self._owners) > 1
+        self._refusals[owner] = why
+        self._awaited.discard(owner)
+        if why and (is_answer or why != before) and not is_of_another:
+            self.note("reset-refused", owner=owner, why=why)
 
     def unconfirmed(self, owner: str, stop: EstopCommand) -> None:
         self.note("stop-not-confirmed", owner=owner, stop=str(stop.stop))

@@ -107,7 +107,7 @@ def _rules(what: str, trial: BrokerTrial, peer: Peer, topic: str) -> CheckResult
     mid = peer.publish(other, payload, qos=1)
     is_back, _ = _echo(trial, peer, topic)  # sent later: if the first one was let through, it came before this
     if payload in peer.payloads():
-        fix = "start it with the files of `pebble fleet init`, see docs/ext/fleet.md"
+        fix = "start it with the files of `pebble fleet init FOLDER --host NAME`, see docs/ext/fleet.md"
         return failed("has no rules: with this account one can pose as any robot, and drive it", fix, what)
     code = peer.acks.get(mid, 0)
     if code >= REFUSED and not reasons.concerns_login(code):

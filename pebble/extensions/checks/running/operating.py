@@ -11,6 +11,7 @@ from pebble.errors import PebbleError
 from pebble.extensions.checks.conform.control import Driver
 from pebble.extensions.checks.conform.motion import LATE_S, at_the_wheel, rested
 from pebble.extensions.checks.running.robot import RobotUnderTest
+from pebble.extensions.operator.client.driveable import doubt_of, is_cut_off
 from pebble.extensions.operator.client.estop import StopSender, new_name, send
 from pebble.extensions.operator.client.estop_states import Reset
 from pebble.extensions.operator.client.media_receiver import MediaReceiver
@@ -87,6 +88,8 @@ def stop(robot: RobotUnderTest) -> CheckResult:
     if took_s is None:
         text = f"NOT CONFIRMED after {_CONFIRMED_S:g} s: {why}"
         return failed(text, "pebble doctor CONFIG; pebble estop CONFIG")
+    if is_cut_off(robot.view.driveable):
+        return failed(f"{robot.view.name} is latched; {doubt_of(robot.view.driveable, stopped=True)}", _LOG)
     sender_side = "its own side" if side.own else "operators"
     return ok(f"confirmed {took_s:.2f} s after {sender_side} sent it, and ended by name")
 

@@ -140,7 +140,8 @@ def _of_config(config: Config, target: Target) -> tuple[str, Any, Names, str]:
         return kind, settings, Names(base, addresses, _account(settings)), f"the remote side of {config.base}"
     names = Names(base, addresses)
     if config.transport.kind == "zenoh":
-        where = f"the hub of {config.base} in {config.run_dir()} (is the robot up?)"
+        start = f"pebble up {config.path or 'CONFIG'}"
+        where = f"the hub of {config.base} in {config.run_dir()} (is the robot up? `{start}` starts it)"
         return "zenoh", zenoh_settings(config, client=True), names, where
     where = f"{config.base} by {config.transport.kind}"
     if config.transport.kind == "mqtt":

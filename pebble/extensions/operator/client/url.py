@@ -41,7 +41,7 @@ def _zenoh(path: str) -> ZenohSettings:
     except OSError as error:
         raise UrlError(f"--url zenoh:{path}: {error.strerror}: run this as the user of the robot") from None
     if not is_there:
-        raise UrlError(f"--url zenoh:{path}: there is no such directory, is the robot up?")
+        raise UrlError(f"--url zenoh:{path}: there is no such directory, is the robot up? `pebble up CONFIG` starts it")
     return ZenohSettings(run_dir=run_dir, client=True)
 
 

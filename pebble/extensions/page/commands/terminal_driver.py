@@ -10,6 +10,7 @@ from pebble import contract as c
 from pebble.contract import channel_of
 from pebble.extensions.operator.client.assumed import AXES, HEARD_S, PARKED
 from pebble.extensions.operator.client.drive_reasons import first_reason, words
+from pebble.extensions.operator.client.driveable import doubt_of, is_cut_off
 from pebble.extensions.operator.client.estop import StopSender, new_name
 from pebble.extensions.operator.client.names import id_of
 from pebble.extensions.operator.client.robot_view import RobotView
@@ -58,7 +59,8 @@ class TerminalDriver:
     @property
     def filters(self) -> list[str]:
         """Return filters of the topics that :meth:`receive` needs."""
-        channels = [c.ESTOP_STATE, c.CONTROL_STATE, c.CAPABILITIES, c.ONLINE, c.CHARGING_LEVEL, c.AUTONOMY_STATUS]
+        channels = [c.ESTOP_STATE, c.CONTROL_STATE, c.CAPABILITIES, c.ONLINE, c.STATUS]
+        channels += [c.CHARGING_LEVEL, c.AUTONOMY_STATUS]
         if self._heartbeat:  # as heartbeats, the state of the link exists only outside of the robot
             channels.append(c.LINK)
         if self._assumes:
@@ -137,10 +139,13 @@ class TerminalDriver:
         motion = self._reason or ("let go first" if self._pressed else "ready")
         if self._driven.state is State.MOVING:
             motion = f"driving x {x:+.2f} z {z:+.2f}"
+        if is_cut_off(robot.driveable):  # whatever is sent, nothing moves it
+            motion = self._reason
         parts = (
             self.name,
             robot.itself,  # that it drives itself, by a script
             motion,
+            doubt_of(robot.driveable, stopped=robot.latched),
             self.unconfirmed and f"EMERGENCY STOP NOT CONFIRMED: {self.unconfirmed}",
             f"{view.asks} asks for control: l lets {view.asks} drive" if view.you and view.asks else "",
             *([] if view.you else self._failures),  # ``you``: this terminal has control

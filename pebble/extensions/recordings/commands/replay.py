@@ -89,7 +89,7 @@ def replay(
     player = playing.play(make_transport, rules, make_player)
     typer.echo(f"{player.sent} sent, {player.skipped} skipped")
     unread = report_unread(problems(source.damages))
-    return unread if playing.ended in ("", "SIGINT") else 1
+    return unread if playing.ended in ("", "SIGINT", "SIGTERM") else 1
 
 
 def _read(recordings: list[Path], options: Options) -> tuple[ReplaySource, Rules]:

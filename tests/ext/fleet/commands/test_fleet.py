@@ -288,13 +288,13 @@ def test_a_bridge_notes_what_passes_and_a_command_prints_it(
     robot.write_text(json.dumps({"robot": {"id": "rover"}, "services": {}}))
     assert run("fleet", "audit", robot, columns=200) == 0
     lines = [line.rstrip() for line in run.out.splitlines()]
-    assert [line.split()[2] for line in lines[1:3]] == ["first", "start"]
-    shown = [line.split()[2:] for line in lines[3:6]]  # of two connections
+    assert [line.split()[2] for line in lines[1:4]] == ["first", "stop", "start"], "by time, not as stored"
+    shown = [line.split()[2:] for line in lines[4:7]]  # of two connections
     assert ["stop", "ann?", "operators", "stop", stop] in shown
     assert ["script-start", ROBOT, "robot", "file", "a"] in shown
     assert {row[0] for row in shown} == {"stop", "script-start", "refused"}
-    assert "× 9" in lines[6]
-    assert lines[6].endswith(r"by \u001b[2J")
+    assert "× 9" in lines[2]
+    assert lines[2].endswith(r"by \u001b[2J")
     assert lines[8].startswith("3 lines cannot be read")
     assert run("fleet", "audit", robot, "-n", "1") == 0
     assert ("× 9" in run.out, run.out.count("\n")) == (True, 3)
