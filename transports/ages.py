@@ -77,7 +77,7 @@ class SenderClocks(Generic[K]):
         """Return the seconds that a message stamped ``sent`` has waited at ``now``; learn the sender's clock from it.
 
         A message that has waited for more than ``late_s`` is late. ``waited_s``: the most that it can have waited, by
-        other evidence; unless late, it gives `_Clock.proved`. A clock under 2 s old returns at least ``waited_s``.
+        other evidence, which counts for `_Clock.proved` if not late. A clock under 2 s old returns at least that.
         """
         with self._lock:
             clock = self._clocks.get(key)

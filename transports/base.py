@@ -469,7 +469,7 @@ class Transport(ABC):
             subscription.renew()
 
     def _sync_retained(self, known_topics: Collection[str]) -> None:
-        """Send the pending retained messages; then our others but ``known_topics``, which the other end has (T9)."""
+        """Send our pending retained messages, then our others not on the other end's ``known_topics`` (T9)."""
         with self._publishing:
             self._own.send_again(known_topics, lambda message: self._send(message, False))
 

@@ -232,7 +232,7 @@ class Forwarder:
     ) -> Forward | Drop:
         """Return how to forward ``message``, or why it does not pass. Must be fast.
 
-        ``topic`` is the topic on the other side. ``named`` is True if the sender has an account, or names do not count.
+        ``topic`` is the topic on the other side. ``named``: the sender has an account, or needs none.
         """
         if subject is not None and subject.is_stop:
             if not source.window.is_old_stop(message):

@@ -51,7 +51,7 @@ class SideState:
         return self.transport.state is State.CONNECTED
 
     def subscribing(self) -> None:
-        """Note that the owner is about to subscribe: retained messages arrive from now on."""
+        """Note that subscribing to this side begins: its retained messages arrive from now on."""
         self.window.subscribing()
         self.seen.clear()
 

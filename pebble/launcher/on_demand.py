@@ -17,7 +17,7 @@ log = logging.getLogger(__name__)
 
 
 class OnDemand:
-    """The requests in the notes Wanted and Held: a program runs while it is wanted and not held. For one thread."""
+    """The requests in Wanted and Held notes: a program runs while it is wanted and not held. For one thread."""
 
     def __init__(self, reactor: Reactor, supervisors: Iterable[ProcessSupervisor]) -> None:
         self._reactor = reactor

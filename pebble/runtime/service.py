@@ -290,7 +290,7 @@ class Service:
     def _handle(self, channel: Channel, method: Callable[[], None], arrived: float) -> None:
         """Call the handler, unless the message has waited too long in a hung or suspended process.
 
-        Only commands on channels with ``newest`` are dropped.
+        Only commands of which a newer one replaces a waiting one (``Channel.newest``) are dropped.
         """
         if channel.kind is Kind.COMMAND and channel.newest and self.clock() - arrived > WAIT_LIMIT_S:
             self.count_late(channel)

@@ -233,8 +233,8 @@ class Catalogue:
     ) -> tuple[Setting, ...]:
         """Return the config's settings, and then those that only the script gives.
 
-        Of a setting in both, the config's counts. But our scripts read their options themselves: how such an option is
-        written on the command line is as the script says, and one that the script does not know is left out.
+        Of a setting in both, the config's counts. But our scripts read their options themselves: so their settings are
+        written on the command line in the script's form, and a setting of the config that the script lacks is left out.
         """
         configured = [Setting(**asdict(argument)) for argument in section.args]
         options = {setting.key: setting for setting in described.configs}

@@ -52,10 +52,10 @@ class MotorOwners:
         return newest(state.last_barred for state in self._states.values())
 
     def steps_to(self, run: int) -> Iterator[int]:
-        """Yield run numbers whose zeros make every owner treat ``run`` as newer.
+        """Yield run numbers: after a zero with each of them, every owner takes ``run`` for newer than what it bars.
 
-        Needed if a stranger sent numbers far ahead while an owner was away. To that owner ``run`` may seem older,
-        because it is more than half of all numbers behind.
+        Needed if a stranger sent numbers far ahead while an owner was away. If ``run`` is more than half of all numbers
+        ahead of that owner's, it seems older, as numbers begin again after LAST_RUN. A number half-way there does not.
         """
         for barred in [state.last_barred for state in self._states.values()]:
             if not newer(run, barred):

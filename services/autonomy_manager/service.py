@@ -83,7 +83,7 @@ class AutonomyManager(Service):
         self._runner.close(_CLOSE_S)
 
     def on_connected(self) -> None:
-        """At the first connection listen to who has control, and bar the run of a predecessor."""
+        """Listen, from the first connection on, to who has control; bar the run of an earlier, killed process."""
         if not self._connected_before:
             self._connected_before = True
             self.listen(CONTROL_STATE, self._control)
@@ -197,7 +197,7 @@ class AutonomyManager(Service):
         self.changed()
 
     def _on_person_stops(self) -> None:
-        """End a script that does not sign its commands; refuse starts while the arbiter still refuses scripts."""
+        """End an unsigned script, after a person's final zero; start none while the arbiter refuses scripts."""
         self._refused_until = self.clock() + _HOLD_S
         self._end_unsigned()
 

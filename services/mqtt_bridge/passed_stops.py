@@ -42,7 +42,7 @@ def named(payload: bytes) -> bytes:
 
 
 class Pending(Struct, frozen=True):
-    """A stop that an owner has not confirmed. ``first``: when it was first forwarded; ``at``: since when it waits."""
+    """A stop that an owner has not confirmed. ``first``: when it first came; ``at``: when the copy that waits came."""
 
     stop: EstopCommand
     first: float
@@ -96,9 +96,9 @@ class PassedStops:
         return {key: owner.pending for key, owner in self._owners.items() if owner.pending is not None}
 
     def accept(self, payload: bytes) -> list[bytes]:
-        """Remember a named stop as forwarded, and let owners confirm it; return the payloads to publish.
+        """Remember a named stop as forwarded, and expect owners to confirm it; return the payloads to publish.
 
-        An owner that was reset after the stop was first forwarded gets a copy only if it has yet to confirm the stop.
+        If owners were reset since it first came, and need not confirm it, only the others get it: a copy for each.
         """
         if not is_stop(payload):
             return [payload]

@@ -261,7 +261,7 @@ RULES: tuple[Rule, ...] = ((Root, _check),)
 
 
 def programs(config: Config) -> list[Program]:
-    """Return the bridge's program, or none. One that only reads has another name, which is no motor owner's."""
+    """Return the bridge's program; none if disabled. One that does not drive, no motor owner, is ``ros1_reader``."""
     section = config.section(Ros1)
     if not section.enabled:
         return []

@@ -74,7 +74,7 @@ class Clips:
             return None
 
     def _clip(self, path: Path | None, name: str) -> Clip | None:
-        """Return the clip at this path in the folder, or None. ``name``: the command's, for a path that is no text."""
+        """Return the clip at this path, or None. It is called ``name`` if its path cannot be written as UTF-8."""
         root = self._folder.resolve()
         if path is None or not path.is_relative_to(root) or path.suffix.lower() not in self._endings:
             return None
@@ -87,7 +87,7 @@ class Clips:
         return Clip(inside if is_text(inside) else name, path)  # no text: the command names a link to this file
 
     def _paths(self) -> Iterator[str]:
-        """Yield the paths of the clips among the first _MOST files, as the folder has them."""
+        """Yield the paths of the clips among the first _MOST files, in the folder's order and spelling."""
         return filter(self._is_clip, islice(self._files(self._folder.resolve()), _MOST))
 
     def _files(self, root: Path) -> Iterator[str]:

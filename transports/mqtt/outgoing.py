@@ -162,7 +162,7 @@ class InFlightTable:
 
     @property
     def waiting_since(self) -> float | None:
-        """Time since when messages of QoS 1 wait and none was acknowledged; None if none waits."""
+        """Time of sending the oldest message without PUBACK or, if later, of the newest PUBACK; None if none waits."""
         if not self._unacked:
             return None
         _, oldest_sent_at = next(iter(self._unacked.values()))

@@ -43,7 +43,7 @@ class Publishers:
             self.thread = 0
 
     def put_late(self, session: zenoh.Session, message: Message) -> None:
-        """Send a retained message that others have missed, not to this client, which gets it from the hub."""
+        """Send others a retained message that they have missed. This client's own subscriptions get it from the hub."""
         treatment = wire.TREATMENTS[message.qos, self._urgent.get(message.topic, False)]
         stamp = wire.pack_live(message.qos, retain_requested=message.retain)
         key, others = topic_to_key(message.topic), zenoh.Locality.REMOTE

@@ -65,7 +65,7 @@ since_boot_ns: Callable[[], int] = partial(time.clock_gettime_ns, time.CLOCK_BOO
 
 
 class LiveStamp(msgspec.Struct, frozen=True):
-    """The attachment of a live message; ``sent_ns`` counts since ``boot``. Both are 0 if the message has none."""
+    """The attachment of a live message; ``sent_ns`` counts since ``boot``. Both are 0 if it has no attachment."""
 
     qos: QoS
     retain_requested: bool | None

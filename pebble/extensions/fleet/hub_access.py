@@ -161,7 +161,7 @@ class AccountAdmission(Admission):
         return not account or session.startswith(account + wire.OF)
 
     def _allowed_will(self, account: str, rules: HubAccount, will: wire.Will | None) -> wire.Will | None:
-        """Return a client's will as one of its account; None if there is none, or the account may not leave it."""
+        """Return a client's will, named after its account; None if it has none, or if the account may not leave it."""
         if will is None:
             return None
         will = replace(will, client=f"{account}{wire.OF}{will.client}")  # so it replaces no other account's will

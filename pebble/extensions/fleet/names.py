@@ -64,8 +64,8 @@ class CheckedNames(Names):
     def sign(self, sender: Sender, message: Message) -> Signed | Drop:
         """Return ``message`` with its sender in the payload, or why it is refused. Called for each message.
 
-        A ``by`` in the payload is only a claim: behind an account it names the person, from a stranger it is removed. A
-        stop needs no account; its claim stays, with a mark.
+        A ``by`` in the payload is only a claim. If the sender has an account, the claim is added to it, as the person's
+        name; if not, it is removed. A stop needs no account; its claim stays, with a mark.
         """
         subject, account, payload = sender.subject, sender.account, message.payload
         channel = None if subject is None else subject.channel

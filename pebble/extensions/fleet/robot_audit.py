@@ -150,10 +150,10 @@ class Audit(Observer):
         self.note("stop-not-confirmed", owner=owner, stop=str(stop.stop))
 
     def _noted_before(self, row: Row, who: str) -> bool:
-        """True if the log tells this of the sender already: the stop has a row, or the lights have blinked like this.
+        """True if the sender has a row for the same stop, or has switched lights so (on or off) in the last minute.
 
-        If not, remember it. A stop may arrive with its sender's account, and once more without: each has a row. Lights
-        that blink have one row on and one off, until they rest for a minute.
+        Remembers the row. A stop may arrive with its sender's account, and once more without: then it has two rows.
+        Lights that blink have one row for on and one for off, and new ones only after they have rested for a minute.
         """
         if row["what"] == "lights":
             key, now = (who, row["on"]), self._clock()

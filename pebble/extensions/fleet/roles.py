@@ -199,7 +199,7 @@ def rules(
 
 
 def metrics(right: Right, extra: Extra | None = None) -> tuple[str, ...]:
-    """Return the metrics below ``incoming/`` that the right may write, as parts of filters."""
+    """Return the metrics below ``incoming/`` that the right may write, with ``+`` for each placeholder ``{name}``."""
     declared = (channel if isinstance(channel, str) else channel.metric for channel in WRITES.get(right, ()))
     return (*(re.sub(r"{[^}]*}", "+", metric) for metric in declared), *getattr(extra, right, ()))
 

@@ -21,7 +21,7 @@ OVERDUE_S = 10.0  # a message that has waited for so long gives way no more
 
 
 class Rank(IntEnum):
-    """The rank of a message: rank N is sent until N times the link's room is in use. Streams wait first."""
+    """The rank of a message. Rank N waits once N times the link's room is in use: streams first, heartbeats last."""
 
     STREAM = 1
     STATE = 2

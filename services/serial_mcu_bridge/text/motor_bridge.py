@@ -102,7 +102,7 @@ class MotorBridge(MotorOwner, SerialService):
         self._show_power(0.0, 0.0)
 
     def _show_power(self, left: float, right: float) -> None:
-        """Publish the commanded power of the wheels, for their sensors: each change, and again while they run."""
+        """Publish the power that the wheels are commanded, for odometry: each change, and again while not zero."""
         now = self.clock()
         if self._publishes_touch and ((left, right) != self._power or ((left or right) and now >= self._again_at)):
             self._power, self._again_at = (left, right), now + _AGAIN_S

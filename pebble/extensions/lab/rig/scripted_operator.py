@@ -91,7 +91,7 @@ class ScriptedOperator:
 
     @property
     def has_control(self) -> bool:
-        """True if the operator has the control that it asked for; also if it has not asked, as where there is none."""
+        """True if the operator has the control that it asked for; also if it did not ask, as a robot may give none."""
         return self.control.held or not self.control.wanted
 
     def release(self) -> None:

@@ -326,7 +326,7 @@ class StopSender:
 
     @property
     def _collect_s(self) -> float:
-        """Return for how many seconds newly heard robots are stopped: longer if there are too many to be confirmed."""
+        """Return for how many seconds robots not heard before are stopped: more if ``robots`` has no room for some."""
         return GIVE_UP_S if self.omitted else COLLECT_S
 
     def _take_overflow(self) -> list[Message]:

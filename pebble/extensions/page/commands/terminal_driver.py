@@ -133,7 +133,7 @@ class TerminalDriver:
         return "" if self.stop is None or self.stop.confirmed else self.stop.robots[self.robot.base].why
 
     def status(self) -> str:
-        """Return the status line: the command sent, or why none is sent, with texts of the robot and other persons."""
+        """Return the status line: the command sent, or why none is. It has names from others: make it printable."""
         view, robot = self._driven.shown(self._tab, self._ticked_at), self.robot
         x, z, _ = self._wanted(self._ticked_at)
         motion = self._reason or ("let go first" if self._pressed else "ready")
@@ -156,7 +156,7 @@ class TerminalDriver:
         return " · ".join(filter(None, parts))
 
     def _assume(self, now: float) -> None:
-        """Assume that a board without capabilities drives after some seconds online, if the person says so."""
+        """Assume that a board without capabilities drives, once it was online for HEARD_S, if the person says so."""
         if self._assumes:
             self._heard_at = min(self._heard_at, now) if self.robot.online(now) else float("inf")
             if now - self._heard_at >= HEARD_S:

@@ -127,7 +127,7 @@ class DrivenRobot:
         self._idle_from = float("-inf")  # when control was given, or the last gesture ended
         self._sent_at = self._received_at = float("-inf")  # the last command of the gesture
         self._repeats: list[float] = []  # when to send the last zero again, in order
-        self._awaited = ("", float("-inf"))  # a page, by its token, that had control; and until when
+        self._awaited = ("", float("-inf"))  # token of a connection that ended with control; until when it counts
         self.renew_key()
 
     def renew_key(self) -> None:
@@ -170,7 +170,7 @@ class DrivenRobot:
         return self.tab is tab or tab in self._wishes
 
     def awaits(self, token: str, now: float) -> bool:
-        """True if control, which no client has now, waits for a page with this token. Asking ends the wait."""
+        """True, once, if ``token``'s connection ended with control, AWAITED_S ago at most, and no client has it now."""
         awaited, until = self._awaited
         if awaited != token:
             return False

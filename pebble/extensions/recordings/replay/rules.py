@@ -202,7 +202,7 @@ def _rebased(plain: Any, old: str, new: str) -> Any:
 
 
 def _is_elsewhere(key: str, value: Any, below: str) -> bool:
-    """True if ``value``, by ``key`` or form, is a topic that does not begin with ``below``: configs may set such."""
+    """True if ``value`` is a topic that does not begin with ``below``: by its form, or as ``key`` ends with topic."""
     if not isinstance(value, str):
         return False
     return not value.startswith(below) and (key.endswith("topic") or parse_topic(value) is not None)

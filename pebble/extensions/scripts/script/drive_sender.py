@@ -81,7 +81,7 @@ class DriveSender:
             self._send(replace(_ZERO, source=SCRIPT, run=self.run), now)
 
     def tick(self, now: float) -> None:
-        """Publish the command that waits for its turn, unless it has become refused."""
+        """Publish the command that waits for its turn; drop it if it moves the robot and there is a :meth:`refusal`."""
         if self._pending is None or now < self._turn:
             return
         pending, self._pending = self._pending, None
@@ -147,7 +147,7 @@ class DriveSender:
         return min(times, default=None)
 
     def _compare(self, owner: str, before: EstopState | None, now: EstopState) -> None:
-        """End this run if an owner's states show an emergency stop or a restart, which forgets what it barred."""
+        """End this run if an owner's states show an emergency stop, or a restart: the owner may forget barred runs."""
         if self._end or before is None:
             return
         if before.boot != now.boot:
