@@ -142,7 +142,7 @@ def _take(owner: Owner, groups: list[int]) -> None:
 
 
 def _rights_of(owner: Owner) -> tuple[Owner, list[int]]:
-    """Return the user with a group (the folder's if the user is in it, else the primary), and all the user's groups."""
+    """Return the user with a group (``owner``'s if the user is in it, else the primary), and all the user's groups."""
     import pwd  # which Windows lacks
 
     with suppress(KeyError):  # a user without an entry has no groups

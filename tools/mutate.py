@@ -333,7 +333,7 @@ class Trial:
         return record
 
     def swaps(self, file: str, text: bytes) -> list[tuple[FunctionType, CodeType]]:
-        """Return a file's functions, each with its code in a changed text; none if a function cannot take that code."""
+        """Return a file's functions, each with its code as compiled from ``text``; none if one cannot take its code."""
         codes = [compile(text, file, "exec", dont_inherit=True)]
         for code in codes:
             codes += [constant for constant in code.co_consts if isinstance(constant, CodeType)]

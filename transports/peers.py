@@ -89,7 +89,7 @@ class FileLock:
 
     @classmethod
     def wait(cls, path: Path) -> FileLock:
-        """Lock a new file. Wait if a process holds its lock for a moment, to see whether the file's owner runs."""
+        """Lock a file for this process; wait if another, which looks whether the owner runs, holds it for a moment."""
         return cls._get(path, fcntl.LOCK_EX)
 
     @classmethod

@@ -85,7 +85,7 @@ class Reader:
         return section
 
     def _key(self, kind: type[Section], known: Mapping[str, Any], key: str, path: problems.Path) -> str:
-        """Return the present name of a key. Note an unknown one, as a warning only if it may be another program's."""
+        """Return a key's present name. Note an unknown key: a warning if another program may use it, else a problem."""
         name = kind.other_names.get(key, key)
         for retired, replacement in kind.all_retired().items():
             if key == retired or (retired.endswith("*") and key.startswith(retired[:-1])):

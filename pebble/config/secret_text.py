@@ -41,7 +41,7 @@ def without_secrets(text: str) -> str:
 
 
 def _without_login(match: re.Match[str]) -> str:
-    """Return a word with stars before its last @: from ``://`` on or, without that, in place of ``NAME:PASSWORD``."""
+    """Return a word with stars before its last @: after ``://``, or in a word without ``://`` for ``NAME:PASSWORD``."""
     word = match[0]
     ats = [at.start() for at in _AT.finditer(word)]
     if not ats:

@@ -64,8 +64,8 @@ def resolve(sender: Side, payload: bytes, facts: Facts) -> Resolution:
     | winner | any                                               | the newest one    | KNOWN     |
     | winner | it was offered the loser's value                  | another one       | RESTORE   |
     | winner | any                                               | another one       | PASS      |
-    | loser  | nothing, and the winner's messages have to arrive | any               | HOLD      |
-    | loser  | nothing, and they have arrived                    | any               | PASS      |
+    | loser  | nothing; the winner's messages have not arrived   | any               | HOLD      |
+    | loser  | nothing; the winner's messages have arrived       | any               | PASS      |
     | loser  | any                                               | the newest one    | KNOWN     |
     | loser  | the newest one is the winner's                    | another one       | CORRECT   |
     | loser  | the loser went back                               | an earlier one    | CORRECT   |

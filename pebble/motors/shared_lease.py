@@ -14,7 +14,7 @@ SETTLES_MS = FOLLOWS_MS + 100
 
 
 class SharedLease(VouchedLease):
-    """The lease of an only owner, and the base class of the two below, which refuse motion while holders may differ."""
+    """The lease of an only owner, and the base of two that refuse motion while owners may disagree who has control."""
 
     until = sys.maxsize  # when everything stops, unless another turn is received before
 

@@ -110,7 +110,7 @@ class MqttBridge(ForwardingService):
 
     @property
     def winner(self) -> Side:
-        """Side whose retained messages count: remote; local where names are checked, as operators' do not pass."""
+        """Side whose retained messages count: remote; local at level `named`, where those of operators do not pass."""
         return Side.LOCAL if self.config.security.named else Side.REMOTE
 
     @property

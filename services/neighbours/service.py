@@ -162,7 +162,7 @@ class NeighboursService(Service):
     # -- what a visit needs
 
     def _number(self, barred: int, received: int) -> int | None:
-        """Return the number of a run that begins now; None if a script of this robot runs, or no number is free."""
+        """Return a number here for another robot's run; None if this robot's script runs, or no number can be made."""
         with self._local.none_runs() as free:
             try:
                 return next_run(self.config, barred, received) if free else None

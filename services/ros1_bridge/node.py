@@ -52,7 +52,7 @@ class Node:
     """A node of ROS 1. Call :meth:`advertise` and :meth:`subscribe`, then :meth:`start`.
 
     One thread has the sockets, one serves the API of the node, one calls the master and publishers, one calls
-    subscribers that were lost. None of them waits for another, so a call that takes long delays no message.
+    lost subscribers (listed by the master, not connected). None waits for another, so a long call delays no message.
     ``on_evicted(why)`` is called, on some thread, when another node has the name: nothing may move from then on.
     """
 
@@ -193,7 +193,7 @@ class Node:
                     self._connect_soon(subscription, source)
 
     def _keep_registered(self) -> None:
-        """Register what the master does not know of this node, and tell lost subscribers about it. Raises RosError."""
+        """Register what the master does not know of this node; tell lost subscribers of this node. Raises RosError."""
         publishers, subscribers, _ = call(self.master, "getSystemState", self.name)
         uri = self._uri_of(self.name)
         if uri not in ("", self.uri) and lives(uri):

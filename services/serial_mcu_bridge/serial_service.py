@@ -115,7 +115,7 @@ class SerialService(Service, ABC):
         return self._heard if self._heard_opened == self.line.opened else 0
 
     def note_start(self) -> None:
-        """Note that the board has started: a restart, if it was heard since the line was opened."""
+        """Note that the board has started; it is a restart if earlier reports came since the line was opened."""
         if self._heard_since_opening() > 1:  # the report of this start is one of them
             self._starts.began(time.monotonic())
 

@@ -207,9 +207,9 @@ class InFlightTable:
         return self._unacked[mid][0] if mid in self._unacked else None
 
     def first_written(self, now: float) -> dict[str, int]:
-        """Return by topic the size of the largest recent message that is the first of its topic, or of its size there.
+        """Return by topic the size of the largest recent message that may be why the broker closed the connection.
 
-        Because of these the broker may have closed the connection: it has accepted all before an answered ping.
+        It has accepted all before an answered ping: so only one on another topic, or a larger one, may be the reason.
         """
         sizes: dict[str, int] = {}
         for written in [*(ping.written for ping in self._pings), self._written]:

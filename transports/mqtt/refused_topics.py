@@ -85,7 +85,7 @@ class RefusedTopics:
                 return
 
     def note_loss(self, where: str, written: Mapping[str, int] | None, now: float) -> None:
-        """Note a lost connection. ``written``: by topic, sizes of messages that may be why; None if none can be."""
+        """Note a lost connection. ``written``: by topic, the size of a message that may be why; None: no message is."""
         written, trial, self._trial = written or {}, self._trial, None
         self._quiet_at = now + QUIET_S
         ordinary = [topic for topic in written if not self._is_vital(topic)]  # those that may be withheld at any size

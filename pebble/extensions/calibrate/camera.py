@@ -55,7 +55,7 @@ def collect(
 ) -> tuple[list[Floats], tuple[int, int]]:
     """Return the corners of the tag in up to 27 different places, and the width and height of the pictures.
 
-    ``still``: every picture counts. Otherwise the tag must be at rest, and 15 well-spread places are enough.
+    ``still``: photos, which all count. In a stream the tag must be at rest, and 15 well-spread places are enough.
     """
     by_view: dict[View, Floats] = {}
     size, resting = (0, 0), 0  # resting: pictures in a row in which the tag rests

@@ -138,9 +138,9 @@ class Legs:
         ends: Callable[[Counts], bool],
         late: str = "is it slower than --speed says?",
     ) -> Counts:
-        """Drive until ``ends`` is true for the counts since the start, and the wheels stand; return the counts.
+        """Drive until ``ends`` is true for the counts since the start. Return the counts once the wheels stand.
 
-        ``late``: the reason in the error if that takes too long.
+        ``late``: the reason in the error if ``ends`` is not true in time.
         """
         robot, start = self._robot, self._counts()
         until = self._clock() + MOST * expected_s + 0.5  # motors take a moment to their speed

@@ -124,13 +124,13 @@ class Observer:
     # -- what is sent
 
     def send(self, channel: c.Channel, value: object) -> float:
-        """Publish a command, as bytes or as its struct; return the time (monotonic)."""
+        """Publish a command, as bytes or as its struct; return the time of sending (monotonic)."""
         payload = value if isinstance(value, bytes) else codec.encode(channel, value)
         self.transport.publish(channel.topic(self.base), payload, qos=QoS(channel.default_qos), urgent=True)
         return time.monotonic()
 
     def sent(self, seconds: float) -> float:
-        """Wait until the broker has acknowledged all commands, at most ``seconds``; return the time (monotonic)."""
+        """Wait up to ``seconds`` until the broker has acknowledged all commands; return the time then (monotonic)."""
         self.wait(lambda: self.transport.outgoing.waiting == 0, seconds)
         return time.monotonic()
 
@@ -153,7 +153,7 @@ class Observer:
     def beside(self, program: str, *filters: str) -> Iterator[tuple[Transport, deque[Message]]]:
         """Yield a second connection that reads ``filters``, and its messages. ``program``: as in :class:`Target`.
 
-        Each filter is a subscription of its own, as some brokers refuse one of them.
+        Each filter is a subscription of its own, as some brokers refuse one filter and grant the others.
         """
         messages: deque[Message] = deque(maxlen=_MOST)
         with connected(replace(self.target, program=program)) as (beside, _):

@@ -39,7 +39,7 @@ class Server(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit
     """The place where a broker of the fleet listens. ``unencrypted``: a port for boards without TLS.
 
     ``included``: it is the mosquitto of its machine, which includes `mosquitto.conf` in its own configuration. Programs
-    of that machine reach it at ``PLAIN_PORT`` of loopback, where TLS would keep out a robot whose clock is not set.
+    there reach it at ``PLAIN_PORT`` of loopback, without TLS, which would keep out a robot whose clock is not set.
     """
 
     host: str

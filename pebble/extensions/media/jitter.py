@@ -196,7 +196,7 @@ class JitterBuffer:
         return True
 
     def _next(self, now: float) -> Chunk | None:
-        """Return the next packet's sound, or estimated sound for a gap before it; None if that is used up."""
+        """Return the next packet's sound, or estimated sound for a gap before it; None if there is neither."""
         if not self._waiting:
             if self._last is not None and not self._concealed:
                 self.counters.add("underruns")

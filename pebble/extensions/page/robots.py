@@ -249,9 +249,9 @@ class Robots:
     def refresh(self, now: float) -> None:
         """Send values that change with time. Call this every 0.25 s.
 
-        Whether a component is online is sent at once. Ages are sent each second for open components. The others take
-        turns, each every ``turn_s``: so they are _REFRESHES_PER_S a second, and a thousand robots cause no flood. At
-        most a third of these are sent in one call.
+        Whether a component is online is sent at once. Ages are sent each second for open components. The others
+        take turns, at most _REFRESHES_PER_S of them a second, so that a thousand robots cause no flood. One call sends
+        about a third of this number at most.
         """
         due: list[Component] = []
         opened = {interest.watched for interest in self.interests}

@@ -205,9 +205,9 @@ class ThinUplink(Uplink):
                 self._hold.note_drive(self._clock())
 
     def _drop_late(self) -> None:
-        """Drop late commands if there are so many that a stop would wait behind them in the broker's queue.
+        """Connect again if so many late commands come that a stop would wait behind them in the broker's queue.
 
-        They are useless by the time they come, and a new connection drops all that wait. From then on stops have a
+        This drops the commands that wait there: they would be useless by the time they come. From then on stops have a
         connection of their own.
         """
         late, now = self._late, self._clock()

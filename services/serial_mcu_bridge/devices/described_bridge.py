@@ -213,7 +213,7 @@ class DescribedBridge(SerialService):
             self.log.warning(text, uid)
 
     def _publish_device(self, manifest: Manifest) -> None:
-        """Receive the commands of a device that has described itself, and publish what it is."""
+        """Subscribe to the commands for a device that has described itself, and publish what it is."""
         device = self.device = Device(manifest, self.addresses, ImuReports(self.options, self.instance))
         hello = device.hello
         self.log.info("%s: %r, firmware %r, %d interfaces", device.uid, hello.model, hello.firmware_version,

@@ -125,6 +125,6 @@ def _full_blocks(part: bytes) -> bytes:
 
 
 def _block(part: bytes) -> bytes:
-    """Return the last COBS block of ``part``: the bytes after its full blocks. It also stands for a zero after them."""
+    """Return ``part``'s last COBS block: the bytes after its full blocks. If another follows, it implies a zero."""
     last = part[len(part) - len(part) % _BLOCK :]
     return bytes((len(last) + 1,)) + last

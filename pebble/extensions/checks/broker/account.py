@@ -33,9 +33,9 @@ def robot_account(
 ) -> Iterator[CheckResult]:
     """Publish probe messages below ``base`` and check that the broker accepts them.
 
-    No program takes a probe for anything else. ``reads``: a further filter that the broker must grant. A probe must
-    come back within ``answer_s`` with MQTT 3.1.1, which tells no refusal, or if ``reads`` is given. Above the level
-    ``open``, a probe in the name of another robot must not come back.
+    No program takes a probe for anything else. ``reads``: a further filter that the broker must grant. If it is
+    given, a probe must come back within ``answer_s``; also with MQTT 3.1.1, by which a broker cannot tell a refusal.
+    Above the level ``open``, a probe in the name of another robot must not come back.
     """
     try:
         with reached(settings, "") as trial:  # "": no topic here is below it, as all are complete

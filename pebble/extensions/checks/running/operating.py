@@ -95,7 +95,7 @@ def stop(robot: RobotUnderTest) -> CheckResult:
 
 
 def _end(robot: RobotUnderTest, name: str, before: dict[str, list[str]]) -> str:
-    """End this stop, but none newer than ``before``, each owner's known stops; return why the robot stays stopped."""
+    """End this stop, unless stops came that are not in ``before`` (by owner); return why the robot stays stopped."""
     view = robot.view
     robot.wait(lambda: all(name in state.recent for state in view.estop.states.values()), 1.0)
     if not view.latched:

@@ -1,6 +1,6 @@
 """``pebble fleet lan`` and ``pebble fleet up``: where the robots of a LAN meet, from its files to its programs.
 
-At its hub each robot and each board is a *neighbour* of the others, which they may receive from.
+Each robot and each board is a *neighbour* at the hub of the LAN: it may receive messages of the others.
 """
 
 from __future__ import annotations

@@ -155,7 +155,7 @@ class DrivenRobot(StockClient):
 
 
 class StandIn(Robot):
-    """A robot as a user would build it without us."""
+    """A robot as a user would build it without Pebble."""
 
     def launch(self) -> None:
         reports = ["--reports"] if self.reports else []

@@ -201,7 +201,7 @@ class RobotStop:
         self._given_up = True
 
     def _survives(self, owner: str) -> bool:
-        """True if a power cut would change nothing for this owner, or if it cannot save anything."""
+        """True if no save is awaited: the owner has saved the stop, was reset since, or cannot save anything."""
         state = self.estop.states.get(owner)
         return state is not None and (state.persisted is not False or not state.latched)
 

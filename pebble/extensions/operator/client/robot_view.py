@@ -319,7 +319,7 @@ class RobotView:
 
     @property
     def itself(self) -> str:
-        """Return the words for people that the robot drives itself, and by which script; empty if it does not."""
+        """Return words that tell people that the robot drives itself, and by which script; empty if it does not."""
         is_overridden = self.autonomy is not None and self.autonomy.overridden is True
         if not self.script or self.latched or is_overridden:
             return ""

@@ -94,11 +94,11 @@ class Tab:
     last_ended: int = -1  # this gesture and all before it have ended
 
     def end_until(self, gesture: int) -> None:
-        """Note that this gesture, and all before it, have ended for good."""
+        """Note that this gesture, and all earlier ones, have ended for good."""
         self.last_ended = max(self.last_ended, gesture)
 
     def interrupt(self, gesture: int, now: float) -> list[Command]:
-        """End this gesture, and all before it, for good; halt the robot if the page moves it by one of them."""
+        """End this gesture, and all earlier ones, for good; halt the robot if the page moves it by one of them."""
         self.end_until(gesture)
         return [] if self.moves is None or self.gesture > gesture else self.moves.interrupt(now)
 
@@ -201,7 +201,7 @@ class DrivenRobot:
     def take(
         self, tab: Tab, now: float, granted: Callable[[], None], failed: Callable[[str], None], *, over: bool
     ) -> list[Command]:
-        """Request control for a page; ``over``: even from its holder. Return what to publish if this server gives it.
+        """Request control for a page; ``over``: even from its holder. Return what to publish if the server grants it.
 
         ``granted``, or ``failed`` with the reason, is called with the answer: now, or after the robot's next state.
         """
@@ -387,7 +387,7 @@ class DrivenRobot:
         return words(Code.LATE) if tab.clock.late(op.t, now) else ""
 
     def _zero(self, tab: Tab, op: DriveOp, now: float) -> list[Command]:
-        """Return a zero to publish, which is sent in every state. It ends the gesture, and all before it."""
+        """Return a zero to publish, which is sent in every state. It ends this gesture and the page's earlier ones."""
         tab.end_until(op.g)
         if tab.moves is self and op.g >= tab.gesture:
             self._on(Event.LETS_GO, now)

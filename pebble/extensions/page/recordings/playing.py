@@ -1,4 +1,4 @@
-"""The process that plays one robot's recording for one page: it takes what the page asks for, and sends its messages.
+"""The process that plays one robot's recording for one page: it obeys the page, and sends the recording's messages.
 
 Both ways each message has a head: its size, and whether it is text or binary. The program:
 ``python -m pebble.extensions.page.recordings.playing SOCKET FOLDER ROBOT AT_MS``.

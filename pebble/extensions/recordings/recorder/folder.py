@@ -97,7 +97,7 @@ class Folder:
 
     @classmethod
     def is_in_use(cls, root: Path) -> bool:
-        """True if a recorder writes in ``root``, or might without being noticed."""
+        """True if a recorder writes in ``root``, or if one may do so because the file system has no locks."""
         with as_owner(root):
             if not (root / LOCK).exists():
                 return False

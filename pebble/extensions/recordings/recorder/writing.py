@@ -73,7 +73,7 @@ class Writing:
     def mend_leftovers(self) -> int:
         """Finish the files that an earlier recorder has left; return their number.
 
-        Without a lock they may be another recorder's; then they stay as they are.
+        Where the folder cannot be locked, a recorder that runs may still write them: then they stay as they are.
         """
         open_paths = {file.path for file in self._files.by_lane.values()}
         leftovers = [entry.path for entry in self._folder.entries() if entry.is_active and entry.path not in open_paths]

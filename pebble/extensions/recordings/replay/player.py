@@ -220,7 +220,7 @@ class Player:
         self.ended = True
 
     def _open(self, since_ns: int, position_ns: int = 0) -> None:
-        """Continue with the messages from ``since_ns``, at ``position_ns``; 0: at the first of them."""
+        """Read the messages from ``since_ns`` on, and play from ``position_ns``; 0: from the first message's time."""
         self.at_end = False
         self._reading.open(since_ns)
         if position_ns:

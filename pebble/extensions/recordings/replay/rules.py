@@ -99,7 +99,7 @@ class Rules:
         return Outgoing(Message(address.topic, shifted(payload, by_ns), address.qos), moves)
 
     def _listed(self, channel: Channel) -> _Address | None:
-        """Return the channel's address; None if it is not published, or if its robot is none of :attr:`robots`."""
+        """Return how the channel's messages are published; None if they are not, or its robot is not in ``robots``."""
         address = self._address(channel)
         return address if address is not None and address.base in self.robots else None
 
@@ -108,7 +108,7 @@ class Rules:
         return self._remembered_address(channel.topic, metadata.get("qos", "0"), metadata.get("retained") == "1")
 
     def _find_address(self, topic: str, qos: str, retained: bool) -> _Address | None:
-        """Return the address for messages of a topic; None if none is to be published.
+        """Return how messages of a topic are published; None if none is to be published.
 
         ``retained``: the recorder received them as old ones.
         """

@@ -50,7 +50,7 @@ class SensorRange:
         return self.high - self.low >= _SMALLEST_SWING
 
     def update(self, value: float) -> None:
-        """Add a value. A clear turn of the signal away from its farthest value ends a half wave."""
+        """Add a value. A half wave has ended once the signal has gone back clearly from its farthest value."""
         if not self._started:
             self._started = True
             self.low = self.high = self._pivot = value
