@@ -182,8 +182,11 @@ def test_no_other_thread_enters_before_the_own_one_that_waits() -> None:
 
 
 def test_a_lock_that_is_shut_is_never_entered() -> None:
-    lock = WorkLock()
+    lock, left = WorkLock(), threading.Event()
+    assert lock.try_enter()
+    threading.Timer(0.05, lambda: (left.set(), lock.leave())).start()
     lock.shut()
+    assert left.is_set(), "it waits for the thread that works"
     assert not lock.try_enter()
 
 

@@ -92,7 +92,7 @@ CASES = {
     "repeated": ("m....m....m....m", [True]),
     "then cut off": ("m....m" + "." * 20, [True, False]),
     "and back": ("m....m" + "." * 20 + "m", [True, False, True]),
-    "a new connection with a retained one": ("m....m.cm" + "." * 20, [True, False]),
+    "a new connection with a retained one": ("m....m.cm" + "." * 12, [True, False]),
     "a new connection": ("m....mcm....m....m", [True]),
 }
 

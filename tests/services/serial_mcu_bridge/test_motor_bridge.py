@@ -212,7 +212,9 @@ def test_every_field_of_a_line_is_published_and_what_the_motors_get_again_while_
     bench.mcu.charge(True)
     assert until(lambda: bench.payloads("charging-status")[-1] == {"value": True})
     assert bench.payloads("charging-status") == [{"value": False}, {"value": True}], "changes alone are published"
+    began = time.monotonic()
     assert until(lambda: bench.drive(0.5) or len(bench.payloads("motor-power/serial")) >= 3)
+    assert time.monotonic() - began > 0.9, "at most twice a second"
     assert {tuple(power.values()) for power in bench.payloads("motor-power/serial")} == {(0.5, 0.5)}
     assert until(lambda: bench.payloads("motor-power/serial")[-1] == {"left": 0.0, "right": 0.0})
 
