@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from pebble.forwarding.event_buffer import LIMIT
-from pebble.forwarding.probes import PROBE_REQUEST
+from pebble.forwarding.probes import NO_PROBE, PROBE_REQUEST
 from pebble.forwarding.routing import Side
 from pebble.forwarding.service import CHECK_AGAIN_S
 from pebble.forwarding.side import Gate
@@ -300,6 +300,7 @@ class TestWrongBroker:
     ) -> None:
         bridge = mirror.start("bridge", broker=Hub(), enabled=True)
         mirror.run()
+        assert mirror.local.payloads("outgoing/bridge-probe").count(NO_PROBE) == 2, "before the first one, and after all"
         bridge.uplink.reply = Answer(1, 0.0, None, delivered_s=9.0)
         waiting = mirror.start("mirror", enabled=True)
         began = mirror.now
