@@ -300,7 +300,7 @@ class TestWrongBroker:
     ) -> None:
         bridge = mirror.start("bridge", broker=Hub(), enabled=True)
         mirror.run()
-        assert mirror.local.payloads("outgoing/bridge-probe").count(NO_PROBE) == 2, "before the first one, and after all"
+        assert mirror.local.payloads("outgoing/bridge-probe").count(NO_PROBE) == 2, "before probes and after all"
         bridge.uplink.reply = Answer(1, 0.0, None, delivered_s=9.0)
         waiting = mirror.start("mirror", enabled=True)
         began = mirror.now

@@ -154,9 +154,7 @@ def test_the_stop_is_the_last_line_even_while_others_still_drive(mcu: PtyMcu, co
         assert mcu.trace.lines()[-1] == STOPPED
 
 
-def test_after_a_replug_the_first_line_is_the_stop(
-    mcu: PtyMcu, host: Host, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_after_a_replug_the_first_line_is_the_stop(mcu: PtyMcu, host: Host, caplog: pytest.LogCaptureFixture) -> None:
     host.line.drive(drive_line(0.7, 0.7))
     assert traced(mcu, "M 0.700 0.700")
     mcu.unplug()
