@@ -91,7 +91,10 @@ def _run(body: dict, stops: bool) -> int:
 
 
 def _valid_ms(body: dict, stops: bool) -> int:
-    """Return the limit in the command; -1: there is none, or a wrong one in a zero. Raises ValueError, as _run."""
+    """Return the milliseconds for which a command is valid; -1: none is given, or a wrong one in a zero.
+
+    ``stops``: the command is a zero. Raises ValueError for a wrong one in any other.
+    """
     value = body.get("valid_ms")
     if value is not None:
         if type(value) in (int, float) and 0 <= value < 1e12 and (stops or value >= 1):
@@ -102,6 +105,7 @@ def _valid_ms(body: dict, stops: bool) -> int:
 
 
 def _axis(body: dict, name: str) -> float:
+    """Return an axis, -1..1, also from a text; 0 if it is missing or no number. Raises ValueError for NaN, infinity."""
     value = body.get(name)
     if isinstance(value, str):
         value = _number(value.strip(" \t\n\r\v\f").lower())

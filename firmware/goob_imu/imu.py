@@ -91,6 +91,7 @@ class Imu:
             self._retry_at = add(now, _RETRY_MS)
 
     def _scale(self) -> None:
+        """Convert the raw data to ``values``, by factors over 2**14, rounded and limited to 16 bits."""
         raw = struct.unpack(">7h", self._data)
         values = self.values
         calibrating = self.calibrated < _CALIBRATION

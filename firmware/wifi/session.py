@@ -153,7 +153,7 @@ class Session:
         return self.client.publish(retain, b"%s/outgoing/%s" % (self.root, topic), payload)
 
     def write(self, now: int, urgent: bool) -> None:
-        """Write waiting bytes, if that is ``urgent`` or the last write was long enough ago."""
+        """Write waiting bytes if that is ``urgent``, the last write was long enough ago, or half the buffer is full."""
         client = self.client
         if self._paused and self.connection.state == "online" and diff(now, self._since) >= _CALM_MS:
             self._paused = False  # the flood is over

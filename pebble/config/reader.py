@@ -158,7 +158,7 @@ class Reader:
         if reading is None or is_raw:  # there is nothing but raw, which would be refused again
             self.notes.problem(path, must_be)
             return _WRONG
-        return self._scalar(annotation, reading.value, path, NODEFAULT)
+        return self._scalar(annotation, reading.value, path, NODEFAULT)  # another form of a valid value
 
     def _parsed(self, metas: list[Meta], value: Any, path: problems.Path) -> Any:
         parse = _extra(metas, "parse")

@@ -29,7 +29,7 @@ class Reactor:
         self._selector = selectors.DefaultSelector()
         self._timers = Timers()
         self._clock, self._on_stall = clock, on_stall
-        self._stood_still_s = 0.0
+        self._stood_still_s = 0.0  # the sum of all stalls, which this clock leaves out
         self._read_at: float | None = None  # when the clock was last read; None while nothing runs
 
     def now(self) -> float:

@@ -108,10 +108,10 @@ class MotorGuard:
         if self._latch.reset(reset.boot, reset.count, ms(age_s), ms(now)):
             self._log.log("reset", logging.WARNING, "emergency stop reset by %s", _described(_given(reset.by), ""))
             self._save()
-        elif self._latch.reset_refused:
+        elif self._latch.reset_refused:  # else it was not latched
             why = _REFUSED_RESETS[self._latch.reset_refused]
             self._log.log("refused", logging.WARNING, "refused a reset: %s", why)
-        self._state.changed(now)
+        self._state.changed(now)  # a refusal is part of the state
 
     def judge(self, drive: Drive, now: float) -> float | None:
         """Judge a drive command; return the seconds for which it moves the motors (0: stop), None if it is refused."""

@@ -71,7 +71,7 @@ class Owner:
                 self.withdrawn_at = now
             return
         self.withdrawn_at = None
-        # After a restart it may be free without a reset, by an older file. A greater count: a stop between two states.
+        # Not after a restart: an older file may have freed it. A greater count shows a stop between two states.
         was_stopped = (
             earlier is not None and earlier.boot == state.boot and (earlier.latched or state.count > earlier.count)
         )

@@ -354,10 +354,10 @@ class MqttBridge(ForwardingService):
 
     def _follow_control(self, payload: bytes) -> None:
         """Note who has control, and the present key: the time stamp of a command with another key is not judged."""
-        keys = None  # the motor owner gives no keys now
+        keys = None  # no motor owner gives keys: with any key it is judged
         with suppress(PayloadError):
             state: ControlState = codec.decode(c.CONTROL_STATE, payload)
-            keys = frozenset([state.key.encode()]) - {b""}  # empty: no client has control
+            keys = frozenset([state.key.encode()]) - {b""}  # none if no client has control: no stamp is judged
             self._observers.control(state)
         self.forwarder.ages.keys = keys
 

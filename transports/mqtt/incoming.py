@@ -120,7 +120,7 @@ class Incoming:
         if self.reason:
             client.close()
         self.more = bytes_left > 0 or not client.drained
-        if self.more:  # else our own `read` notes that the socket is empty
+        if self.more:  # else `Incoming.read` notes that the socket is empty
             self.age.waiting.read(unread - bytes_left)
         return unread - bytes_left
 

@@ -186,7 +186,7 @@ class InFlightTable:
         if message.qos is QoS.DELIVERED:
             self._unacked[mid] = (message.topic, now)
         if message.retain:
-            entry = self._unconfirmed[message.topic]
+            entry = self._unconfirmed[message.topic]  # made by `accept`
             if message.qos is QoS.DELIVERED:
                 entry.mid = mid
             else:

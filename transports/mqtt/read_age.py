@@ -72,7 +72,7 @@ class BrokerDelay:
         self._newest = 0.0  # seconds that the newest answer took; 0: it tells nothing
         self._came_at = 0.0  # when something was received last
         self._stall = 0.0  # seconds for which the broker stood still; messages count as having waited so long
-        self._until = 0.0  # until this time
+        self._until = 0.0  # until this time they count so
         self._prompt = 0  # answers in a row that came right after the newest of several pings
 
     def usual(self, seconds: float) -> None:
@@ -84,7 +84,7 @@ class BrokerDelay:
         self._pings.append(_Ping(now, now, clear))
 
     def stalled(self, since: float, now: float) -> None:
-        """Note that a ping was sent, and nothing read since ``since``: messages may have waited at the broker."""
+        """Note a ping after a pause in our own reading, from ``since`` on: messages may have waited at the broker."""
         self._pings.append(_Ping(since, now, clear=True))
 
     def answered(self, now: float) -> None:
@@ -137,10 +137,10 @@ class BrokerDelay:
             if ping.clear:  # of those that tell anything, the oldest
                 since, sent_at = ping.since, ping.sent_at
                 break
-        if self._came_at <= sent_at and now - sent_at > self._shortest + _NOTICED_S:  # nothing came: it stood still
+        if self._came_at <= sent_at and now - sent_at > self._shortest + _NOTICED_S:  # nothing came since the ping
             self._stall, self._until = now - sent_at, now + _BACKLOG_S
         self._came_at = now
-        waited = max(self._newest, now - since, self._stall if now < self._until else 0.0)
+        waited = max(self._newest, now - since, self._stall if now < self._until else 0.0)  # the cases above
         if waited <= self._shortest + _NOTICED_S:
             return 0.0
         # TCP's present round trip, within bounds: at least the usual one, at most so much longer.

@@ -89,7 +89,7 @@ class RefusedTopics:
         written, trial, self._trial = written or {}, self._trial, None
         self._quiet_at = now + QUIET_S
         ordinary = [topic for topic in written if not self._is_vital(topic)]  # those that may be withheld at any size
-        if trial is not None and ordinary == [trial.topic]:
+        if trial is not None and ordinary == [trial.topic]:  # of those only it was written
             self._blame(where, trial.topic, written[trial.topic], now)
             return
         self._losses = {topic: self._losses.get(topic, 0) + 1 for topic in written}

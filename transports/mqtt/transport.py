@@ -162,7 +162,7 @@ class MqttTransport(Transport):
             for ack in acks:
                 ack.wait(deadline - time.monotonic())
 
-    def ask(self, topics: Collection[str]) -> None:  # by subscribing to each exact topic until the answer has come
+    def ask(self, topics: Collection[str]) -> None:  # by an exact subscription to each, until the answer has come
         deadline = time.monotonic() + _ANSWER_S
         with self._filters.lock:
             connection, unheard = self._connection, [topic for topic in topics if topic not in self._filters]
@@ -170,7 +170,7 @@ class MqttTransport(Transport):
                 return
             for topic in unheard:
                 self._own_message_filter.subscribe_again(topic)
-            # Retained messages come after the SUBACK; the ping's answer follows them.
+            # Retained messages come after the SUBACK, to all subscriptions that match; the ping's answer follows them.
             answer = connection.subscribe([(topic, self._no_local(topic)) for topic in unheard], QoS.LATEST)
             acks = [answer, connection.ping(), connection.unsubscribe(unheard)]
         for ack in acks:

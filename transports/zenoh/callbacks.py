@@ -157,7 +157,7 @@ def direct(function: Callable[[Any], None], at_end: Callable[[], None] | None = 
 
     def run(received: Any) -> None:
         calls = _local.calls if hasattr(_local, "calls") else _begin()
-        calls.begun += 1
+        calls.begun += 1  # until `ended` is as great, the guard sees a callback that runs
         try:
             if guard.rests:
                 guard.wake()

@@ -249,7 +249,7 @@ class ZenohTransport(Transport):
         with self._publishing:
             owed = bool(self._own.pending or lacking)
             self._sync_retained(self._own.keys() - lacking)  # sends all but these
-            self._hub.put_removals(session, lacking)  # it may lack removals, too
+            self._hub.put_removals(session, lacking)  # or it may lack their removals
             return owed
 
     def _refresh(self) -> None:

@@ -213,7 +213,7 @@ class HubWorker:
 
     def _publish_will(self, name: str, will: wire.Will) -> None:
         key, qos = topic_to_key(will.topic), QoS(will.qos)
-        stamp = wire.Stamp(qos, 0, name)
+        stamp = wire.Stamp(qos, 0, name)  # 0: the hub made it
         if will.retain:
             self.apply(Retained(key, will.payload, stamp))
         if self._session is not None:
