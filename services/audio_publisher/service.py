@@ -104,6 +104,7 @@ class AudioPublisher(Service):
             return
         self._rate.poll(now, self.encoding)
         encoder = self._encoder_for(info.rate, info.channels)
+        # captured_ms is when the piece was complete: the time of its end.
         first_ms = info.captured_ms - round(1000 * len(pcm) / (2 * info.channels * info.rate))
         for packet in encoder.encode(pcm, first_ms):
             self._send_packet(packet, now)

@@ -87,6 +87,6 @@ class Guard:
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             return False
-        except OSError as error:  # a file system without locks
+        except OSError as error:  # a file system without locks, where scripts run all the same
             log.warning("%s cannot be locked: %s", self._path, error.strerror)
         return True

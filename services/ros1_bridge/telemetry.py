@@ -152,6 +152,7 @@ class Telemetry:
         self._tell(c.NAVIGATION_STATUS, value, self._names.navigation_status_topic, header)
 
     def _plan(self, channel: Channel, topic: str, metric: LocalPlan, body: bytes) -> None:
+        """Publish a planned path, by at most ``max_points`` of its points, evenly spread."""
         if not self._sampled(channel, metric):
             return
         header, points = messages.route(body)

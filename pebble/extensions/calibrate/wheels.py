@@ -162,6 +162,7 @@ class _Session:
         return Run(name, counts.left, counts.right, moved.turn_rad, moved.mm)
 
     def _spin(self, number: str, sign: int) -> Run:
+        """Drive a spin; return the wheels' steps and the true turn, by the tag, the gyroscope or the person."""
         name = f"{number}, spin {'left' if sign > 0 else 'right'}"
         wanted, turns = self._wanted, sign * self._wanted.turns
         start = self._legs.look() if wanted.truth == "tag" else None

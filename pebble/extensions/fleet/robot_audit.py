@@ -140,7 +140,8 @@ class Audit(Observer):
     def estop(self, owner: str, state: EstopState) -> None:
         """Add a row if the owner has refused a reset; its state shows only why it has refused the last one."""
         why, before = state.reset_refused, self._refusals.get(owner, state.reset_refused)
-        is_answer, is_of_another = owner in self._awaited, why == "boot" and len(self._owners) > 1
+        is_answer = owner in self._awaited
+        is_of_another = why == "boot" and len(self._owners) > 1  # a reset is for one owner's boot: all others refuse it
         self._refusals[owner] = why
         self._awaited.discard(owner)
         if why and (is_answer or why != before) and not is_of_another:

@@ -176,7 +176,7 @@ class JitterBuffer:
             return None
         if now < self._due:
             return None
-        if now - self._due > _DELAY_LIMIT_S:
+        if now - self._due > _DELAY_LIMIT_S:  # called late: what was due is not caught up
             self._due = now
         chunk = self._next(now)
         if chunk is None:

@@ -48,6 +48,7 @@ def split(body: bytes) -> list[bytes]:
 
 
 def _pieces(body: bytes) -> Iterator[bytes]:
+    """Yield the Opus packets of a body, without their lengths. Raises PayloadError."""
     end = 0  # of the last packet
     while end < len(body):
         start = end + _LENGTH.size

@@ -124,9 +124,9 @@ class OpenComponents:
                         continue
                     self._forget(ref)
                     return
-                await asyncio.sleep(self._step_s)
+                await asyncio.sleep(self._step_s)  # the least time between two changes
                 if ref in self._pages and self._filters(ref).keys() == subscriptions.keys():
-                    return
+                    return  # nothing has changed meanwhile, and nothing failed
         finally:
             self._following.discard(ref)
 

@@ -353,6 +353,7 @@ class Robots:
         self._store(component, c.CAPABILITIES.metric, c.CAPABILITIES, message, now)
 
     def _log(self, component: Component, message: Message) -> None:
+        """Add a live log line of a watched component, and tell the pages that watch it."""
         lines = self.logs.get(component.ref)
         if lines is None or message.retain or not message.payload:
             return

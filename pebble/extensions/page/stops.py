@@ -105,8 +105,10 @@ class Stops:
         robots = RobotsOfStop([], [])
         if name in self._stops:
             for ref, stop in self._stops[name].sender.robots.items():
-                is_confirmed = stop.progress in (Progress.CONFIRMED, Progress.SPARED)
-                (robots.confirmed if is_confirmed else robots.unconfirmed).append(ref)
+                if stop.progress in (Progress.CONFIRMED, Progress.SPARED):
+                    robots.confirmed.append(ref)
+                else:
+                    robots.unconfirmed.append(ref)
         return robots
 
     def user(self, name: str) -> str | None:

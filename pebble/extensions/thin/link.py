@@ -220,7 +220,7 @@ class LateRun:
 
     def __init__(self) -> None:
         self.count = 0
-        self._since = self._newest_at = 0.0
+        self._since = self._newest_at = 0.0  # when the first and the newest command of the run came
 
     def note(self, late: bool, now: float) -> None:
         """Count a ``late`` command whose sender does not tell its age; a command in time restarts the count."""

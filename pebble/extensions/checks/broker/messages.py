@@ -168,8 +168,11 @@ def held_back(trial: BrokerTrial, reader: Peer, writer: Peer, topic: str) -> Che
 
 
 def _pair(trial: BrokerTrial, reader: Peer, writer: Peer, topic: str) -> tuple[float, float] | None:
-    """Return a message's round trip, and how much longer the next message takes; None if either is lost."""
-    reader.acknowledge_late()  # a quick one would hide the delay
+    """Return a message's round trip, and how much longer the next message takes; None if either is lost.
+
+    The next one takes longer if the broker holds it back until the first one is acknowledged.
+    """
+    reader.acknowledge_late()  # after a quick acknowledgement nothing would be held back
     sent, probes = list[float](), [new_probe(number) for number in range(2)]
     for probe in probes:
         sent.append(time.monotonic())

@@ -142,6 +142,7 @@ def sizes(robot: Observer) -> CheckResult:
 
 
 def retained(robot: Observer) -> CheckResult:
+    """Check that the channels of states are published with the retain flag, and no others."""
     retained_metrics = {record.metric for record in robot.retained()}
     lacking, stale = set(), set()
     for record in robot.records:

@@ -101,7 +101,7 @@ def _moving_wheels(robot: Observer, since: float) -> list[float] | None:
         return next((wheels for at, wheels in reversed(reports()) if at >= since and any(wheels)), [])
 
     robot.wait(newest_moving, ANSWER_S)
-    robot.look(LATE_S)
+    robot.look(LATE_S)  # more reports may follow, and the newest counts
     return newest_moving() if reports() else None
 
 

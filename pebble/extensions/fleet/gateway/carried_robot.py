@@ -34,7 +34,10 @@ LARGEST = 1024 * 1024  # bytes of a message; the brokers of `pebble fleet` take 
 
 
 class NamedSubjects(Subjects):
-    """A robot's subjects without renamed topics, but with the topics that have an account's name."""
+    """The meaning of a robot's topics, its *subjects*: by the contract's names, also with the sender's account in them.
+
+    Topics that the robot's own config renames are not known here.
+    """
 
     def _find(self, topic: str) -> Subject | None:
         """Return the subject of a topic. For a topic with an account's name, look up the topic without the name."""

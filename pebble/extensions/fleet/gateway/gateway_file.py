@@ -47,7 +47,10 @@ class GatewayFile(Section, frozen=True, kw_only=True):
 
     @property
     def operators(self) -> Mqtt | None:
-        """Return the settings of the operators' broker; None if this gateway only serves neighbours."""
+        """Return the settings of the operators' broker; None if no robot is carried to one.
+
+        That is a gateway which only lets robots of the LAN hear and drive the boards in ``neighbours``.
+        """
         return self.mqtt or (None if self.neighbours else Mqtt())
 
 

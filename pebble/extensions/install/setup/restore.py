@@ -66,7 +66,7 @@ def restore(system: System, file: Path, agree: Callable[[Sequence[str]], None]) 
         target = places.root / name
         for folder in reversed(target.parents):
             if not folder.exists():
-                # By the slash a folder of _PLACES counts as below itself.
+                # With the slash `_place` finds the entry of a folder that is itself in _PLACES, too.
                 owner, mode = _PLACES.get(_place(f"{folder.relative_to(places.root)}/"), _SHARED)
                 system.make_folder(folder, mode, owner)
         if not places.unfinished.exists() and places.etc.is_dir():

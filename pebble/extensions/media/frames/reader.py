@@ -58,10 +58,10 @@ class FrameReader:
         self._seen: set[int] = set()  # ids of writers that were counted
         self._newest = 0, 0  # writer and number of the newest frame that has arrived
         self._replaced = -1  # the writer before that of the newest frame
-        self._must_reopen = threading.Event()
+        self._must_reopen = threading.Event()  # to begin or to stop using shared memory
         self._lacked_room = False  # in shared memory, when the session was opened
-        self._changing = threading.Lock()
-        self._pid = 0
+        self._changing = threading.Lock()  # held while the reader is opened, reopened or closed
+        self._pid = 0  # of the process that opened the session: no fork of it can use it
         self._session: tuple[zenoh.Session, list[Any]] | None = None  # and what is declared there
 
     # -- opening and closing
@@ -298,9 +298,9 @@ class _LatestFrames:
         items, wakeup = self._items, self._wakeup
         while True:
             try:
-                return items.popleft()
+                return items.popleft()  # None: :meth:`wake` or :meth:`close` was called
             except IndexError:
-                if not wakeup.wait(end):
+                if not wakeup.wait(end):  # the time has come
                     return None
 
     def wake(self) -> None:

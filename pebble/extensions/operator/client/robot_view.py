@@ -45,7 +45,7 @@ class Liveness:
         interval_s = None if self.received_at is None else now - self.received_at
         # shorter than any config allows: both heartbeats waited in a queue; longer: a pause, which is no interval
         if interval_s is not None and 0.05 <= interval_s <= 10.0:
-            if not self.reported_offline and self.online_to_people(now) is False:  # people had seen it go
+            if not self.reported_offline and self.online_to_people(now) is False:  # back from a silence alone
                 self._returns.append(now)
             self._intervals.append(interval_s)
         has_plausible_clock = -1.0 <= latency_s <= 10.0

@@ -213,7 +213,7 @@ class HallWheel:
                 self._replay(self._warm_up)
                 return self.mm - before
             self._bound_warm_up(self._warm_up)
-        if self._range.extrema:
+        if self._range.extrema:  # else the range is unknown: the replay at the first extremum adds the sample
             self._add(sample, self._tracker, self._counts)
         return self.mm - before
 
