@@ -22,9 +22,9 @@ class Admission:
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._flags: set[str] = set()
+        self._flags: set[str] = set()  # topics of unknown flags that were admitted, and were not removed since
         self._clock = clock
-        self._second = 0
+        self._second = 0  # the present one, whose messages are counted
         self._counts: dict[tuple[Kind | Channel, bool], int] = {}  # of this second, with a name and without one
 
     def __len__(self) -> int:

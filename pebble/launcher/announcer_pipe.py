@@ -32,8 +32,8 @@ class AnnouncerPipe:
     def __init__(self, reactor: Reactor) -> None:
         self.dropped = 0  # records, and messages that are too long
         self._reactor = reactor
-        self._retry: Timer | None = None
-        self._states: dict[str, Message] = {}
+        self._retry: Timer | None = None  # for another attempt to send states
+        self._states: dict[str, Message] = {}  # the newest of each topic
         self._unsent: dict[str, Message] = {}  # states that the present announcer has not received
         self._socket: socket.socket | None = None
 

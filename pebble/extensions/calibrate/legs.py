@@ -52,7 +52,7 @@ class Legs:
         self._robot, self._expected, self._mm_s, self._clock = robot, expected, mm_s, clock
         self._finder: TagFinder | None = None
         self._tag_id = 0
-        self._picture: Any = None
+        self._picture: Any = None  # the newest one in which the tag was looked for
         self._odometry = Odometry(expected, clock())
         #: Messages from the handlers' threads, with their times; :meth:`_wait` handles them on the thread that drives.
         self._inputs: queue.SimpleQueue[tuple[Callable[..., None], Any, float]] = queue.SimpleQueue()

@@ -47,8 +47,8 @@ class EarlierNames:
             if folder.name == file_name(config.base):  # by default each name has one of its own
                 folder = folder.parent
             self._file = folder / f"names-{file_name(str(config.path.resolve()))}.json"
-        self._names: list[str] = []
-        self._begun = False
+        self._names: list[str] = []  # as in the file, the present one last
+        self._begun = False  # the search, which is made once
 
     def begin(self) -> None:
         """Remember the robot's name, and look for messages of earlier ones. Call this when both sides are connected."""

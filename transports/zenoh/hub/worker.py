@@ -41,7 +41,7 @@ class HubWorker:
         self.alive_clients: set[str] = set()
         self._name, self._wills = name, WillTimes()
         self._has_met = False  # another hub; it was logged
-        self._token: zenoh.LivelinessToken | None = None
+        self._token: zenoh.LivelinessToken | None = None  # by which clients see this hub
         self._waiting, self._intake = WaitingQueries(), Intake()
         self._session: zenoh.Session | None = None
         self._thread = threading.Thread(target=self._run, name="pebble-hub", daemon=True)

@@ -39,7 +39,7 @@ class Drivers:
     def __init__(self, broker: Broker, robots: Robots) -> None:
         self._broker, self._robots = broker, robots
         self._driven: dict[str, DrivenRobot] = {}
-        self._changed: set[str] = set()
+        self._changed: set[str] = set()  # robots whose drivers must be shown to pages again
         self._lights: dict[str, _Lights] = {}  # by robot
         self._grouped: set[str] = set()  # robots that were sent a group since their last zero
         self.refusals = Refusals(broker, lambda ref: self.robot(ref).moved_by, robots.view)

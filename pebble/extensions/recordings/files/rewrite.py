@@ -59,8 +59,8 @@ class Copy:
 
     def __init__(self, writer: RecordingWriter) -> None:
         self._writer = writer
-        self._channels: dict[tuple[object, ...], int] = {}
-        self._schemas: dict[Schema, int] = {}
+        self._channels: dict[tuple[object, ...], int] = {}  # their numbers in the file, by all that makes them differ
+        self._schemas: dict[Schema, int] = {}  # their numbers in the file
 
     def add(self, message: Recorded) -> None:
         channel = message.channel

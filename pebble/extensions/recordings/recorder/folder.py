@@ -60,7 +60,7 @@ class Folder:
     def __init__(self, root: Path) -> None:
         self.root = root
         self.is_locked = False  # also where there are no locks: another recorder may write here
-        self._number = 0
+        self._number = 0  # of the newest file
         self._lock = ExitStack()
         self._lock_file = OwnFile(root / LOCK)
 

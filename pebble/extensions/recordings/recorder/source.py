@@ -38,7 +38,7 @@ class Source:
         self._lost_at = 0  # nanoseconds since 1970; 0: connected, or never was
         self._losses: dict[str, int] = {}  # messages that the transport dropped, by reason, as noted last
         self._fetching: _RetainedFetch | None = None
-        self._wants_fetch = self._was_connected = False
+        self._wants_fetch = self._was_connected = False  # retained messages are to be fetched; it was connected once
         self._transport = self._make()
 
     @property

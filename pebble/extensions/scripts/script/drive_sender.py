@@ -37,10 +37,10 @@ class DriveSender:
         self.run = run
         self._publish = publish
         self._tried = False  # the script has commanded anything: scripts that never do are not ended
-        self._pending: Drive | None = None
+        self._pending: Drive | None = None  # the command that waits for its turn
         self._turn = float("-inf")  # when the next command may be published
         self._zero_is_last = False  # the newest accepted command is a zero
-        self._person_at = float("-inf")
+        self._person_at = float("-inf")  # when a person last commanded
         self._latched: EstopState | None = None  # of the owner that was stopped last
         self._owners: dict[str, EstopState] = {}  # the newest state of each
         self._barred_at: float | None = None  # when an owner first said that it refuses this run for good
