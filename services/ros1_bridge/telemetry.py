@@ -138,6 +138,7 @@ class Telemetry:
             self._tell(c.NAVIGATION_GOAL, self._goal, self._names.navigation_goal_topic, read.header)
 
     def _status(self, body: bytes) -> None:
+        """Publish the status of the goal that the planner pursues, or else of the newest; note when it pursues one."""
         header, goals = messages.goals(body)
         newest = goals[-1] if goals else Goal("", -1, "")
         goal = next((goal for goal in goals if goal.code in _ACTIVE), newest)
@@ -168,6 +169,7 @@ class Telemetry:
         self._tell(channel, value, topic, header)
 
     def _diagnostics(self, body: bytes) -> None:
+        """Publish the diagnostics as a whole, and the battery that is among them."""
         header, parts = messages.diagnostics(body)
         metrics = self._metrics
         if self._sampled(c.DIAGNOSTICS, metrics.diagnostics):

@@ -216,6 +216,7 @@ class JitterBuffer:
         return self._play(number, now)
 
     def _play(self, number: int, now: float) -> Chunk | None:
+        """Return the sound of a waiting packet, or of a later one if too much waits; of a damaged one an estimate."""
         received = self._decode(number)
         excess = self._depth.excess(self.waiting_s, now)
         if received is not None and excess > received.seconds - _ROUNDING_S:
