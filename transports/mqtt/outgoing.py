@@ -48,8 +48,8 @@ class Backlog:
     def __init__(self) -> None:
         self.waiting: dict[str | int, Message] = {}  # retained ones by topic, the others by number
         self._numbers = itertools.count()
-        self._live_bytes = 0
-        self._live = 0
+        self._live_bytes = 0  # of the messages that are not retained,
+        self._live = 0  # and how many these are
 
     def __bool__(self) -> bool:
         return bool(self.waiting)
