@@ -264,8 +264,9 @@ class Trial:
         self.slowest: defaultdict[Path, float] = defaultdict(float)  # seconds of a module's slowest row
         for name, (seconds, _) in passed.items():
             self.slowest[module_of[name]] = max(self.slowest[module_of[name]], seconds)
+        seconds_of = {name: seconds for name, (seconds, _) in passed.items()}
         # rows of a module stay together, as they share what they set up
-        names = sorted(passed, key=lambda name: (self.slowest[module_of[name]], passed[name][0]))
+        names = sorted(passed, key=lambda name: (self.slowest[module_of[name]], seconds_of[name]))
         self.rows = {name: passed[name] for name in names}
         self.lines = {name: lines_of(arcs) for name, (_, arcs) in self.rows.items()}
         self.failing = FAILED.findall(self.failed.read_text())

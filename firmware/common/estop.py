@@ -131,6 +131,7 @@ class EmergencyStop:
         return text.encode()
 
     def published(self, now: int) -> None:
+        """Note that the state which was ``due`` is published. Only the state of the stop has the barred runs."""
         if self.due == _CONTROL:
             self.lease.changed = False
         else:

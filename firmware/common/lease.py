@@ -104,7 +104,7 @@ class Lease:
             self._end(now)
 
     def take(self, client: tuple, ms: int, now: int) -> None:
-        """Pass control on to this client for ``ms``. With 0 there is no key: control is free."""
+        """Pass control on to this client for ``ms``. With () and 0 control is free: there is no key."""
         self.holder = client
         self.asker = ()
         self.key = self._random(4) if ms else ""

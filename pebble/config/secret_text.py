@@ -37,7 +37,7 @@ def without_secrets(text: str) -> str:
     if _AT.search(text):
         text = re.sub(r"\S+", _without_login, _LOGIN_WITH_BLANKS.sub(rf"\1{HIDDEN}@", text))
     text = _PAIR.sub(rf"\1{HIDDEN}", text) if "=" in text else text
-    return _MEMBER.sub(lambda match: f"{match[match.lastindex or 0]}{HIDDEN}", text) if ":" in text else text
+    return _MEMBER.sub(rf"\1\2\3{HIDDEN}", text) if ":" in text else text  # of the three groups one is not empty
 
 
 def _without_login(match: re.Match[str]) -> str:

@@ -69,7 +69,7 @@ class Publisher:
         topic, payload = message.topic, message.payload
         if (source.side, topic) in self._cycles.closed_ways and source.returns.is_echo(topic, payload):
             return True
-        # No other bridge, then, but maybe the side's own broker. Retained ones are recognised by their values instead.
+        # The side's own broker may have sent it back. A retained echo is recognised elsewhere, by its value.
         if source.transport.exact_echo or message.retain or not subject.is_two_way:
             return False
         return source.loopback.is_echo(topic, payload)

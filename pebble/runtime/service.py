@@ -165,10 +165,10 @@ class Service:
         def deliver_direct(message: Message, value: Any, names: dict[str, str]) -> None:
             method(value, self.clock() - message.waited_s, **names)
 
-        deliver = deliver_direct if direct else partial(self._deliver, channel, method)  # the latter only posts
+        deliver = deliver_direct if direct else partial(self._deliver, channel, method)
         receive = self.refusals.reader(channel, deliver, self._remark)
         topic = self.addresses[channel].topic
-        return self.transport.subscribe(topic, receive, qos=QoS(channel.default_qos), direct=True)
+        return self.transport.subscribe(topic, receive, qos=QoS(channel.default_qos), direct=True)  # `receive` is quick
 
     def refused(self, channel: Channel) -> bool:
         """True if the other end refuses to deliver ``channel`` to its ``@on`` method (T21 in docs/transports.md)."""

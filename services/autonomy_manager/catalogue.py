@@ -66,7 +66,7 @@ class _Answer(NamedTuple):
     description: Description
     ours: bool = False
     problem: str = ""
-    broken: bool = False
+    broken: bool = False  # because of ``problem`` it cannot be started; else it only has no settings
     asked: bool = True  # False: what it says itself is not known yet
     drives: bool = True  # False: it says itself that it only measures, and never drives
 
@@ -102,6 +102,7 @@ class Catalogue:
         tell(scripts)
 
     def _scripts(self, folders: Mapping[str, list[Path]], *, asks: bool) -> dict[str, Script]:
+        """Return the scripts by their names. ``asks`` False: run none of them now, see :meth:`_describe`."""
         scripts = {}
         for name, places in folders.items():
             candidates = (self._script(name, folder, asks=asks) for folder in places)
@@ -139,6 +140,7 @@ class Catalogue:
         return sections.get(meant(sections, name), ScriptSection())
 
     def _script(self, name: str, folder: Path, *, asks: bool) -> Script | None:
+        """Return the script in a folder; None if it has neither an entry point nor a command of its own."""
         section = self._section_of(name)
         entry = folder / section.entrypoint
         answer = self._answer(name, folder, entry, section, asks=asks)
@@ -262,7 +264,7 @@ class Catalogue:
 
 
 def files(scripts: Iterable[Script]) -> list[dict[str, object]]:
-    """Return the ``files`` of `autonomy-files`, without forms if they would make it too long."""
+    """Return the ``files`` of `autonomy-files`; from the first form on that would make it too long, without forms."""
     entries: list[dict[str, object]] = []
     room = _LONGEST_FILES
     for script in scripts:

@@ -154,6 +154,7 @@ class AutonomyManager(Service):
 
     @on(ESTOP_STATE)
     def motor_owner(self, state: EstopState, owner: str) -> None:
+        """Handle the state of a motor owner: it may end the run, or show that all stops were reset."""
         self._owners.receive(owner, state)
         if state.latched:
             self._waiting = None

@@ -156,6 +156,7 @@ def goals(body: bytes) -> tuple[Header, list[Goal]]:
 
 
 def diagnostics(body: bytes) -> tuple[Header, list[Health]]:
+    """Return the header of a DiagnosticArray, and the health of each part that it lists."""
     reader = _Reader(body)
     header, parts = reader.header(), []
     for _ in range(reader.count()):

@@ -145,9 +145,9 @@ class Node:
         """Handle another node that has taken this name: move nothing, and wait until it has gone."""
         self.problem = f"the ROS master has ended this node: {why}"
         log.error("%s", self.problem)
-        self._rest()
+        self._stop_publishing()
 
-    def _rest(self) -> None:
+    def _stop_publishing(self) -> None:
         """Stop publishing because another node has this name: disconnect all subscribers, and call ``on_evicted``."""
         self._evicted, self.registered = True, False
         self._on_evicted(self.problem)
@@ -196,9 +196,9 @@ class Node:
         """Register what the master does not know of this node; tell lost subscribers of this node. Raises RosError."""
         publishers, subscribers, _ = call(self.master, "getSystemState", self.name)
         uri = self._uri_of(self.name)
-        if uri not in ("", self.uri) and lives(uri):
+        if uri not in ("", self.uri) and lives(uri):  # "": the master names none
             if not self._evicted:
-                self._rest()
+                self._stop_publishing()
             raise RosError(f"another node is called {self.name}: {uri}")  # to register would end it
         published = {topic for topic, nodes in publishers if self.name in nodes}
         subscribed = {topic for topic, nodes in subscribers if self.name in nodes}

@@ -131,7 +131,7 @@ class SerialService(Service, ABC):
             return
         idle, heard = now - line.output.sent_until >= CHECK_S, self._heard_since_opening()
         state, silent_ms = self._silence.check(line.state, line.opened, heard, now, idle=idle)
-        # None: no report was understood since the line was opened, here although bytes have come
+        # Bytes have come since the line was opened, but no report was understood: then ``silent_ms`` is None.
         misread = silent_ms is None and line.state is LineState.READY and line.received > 0
         sensor_problem = self.sensors.problem
         if sensor_problem and not self._sensor_problem:

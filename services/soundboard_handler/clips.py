@@ -52,6 +52,7 @@ class Clips:
         sizes = accumulate(len(name.encode()) for name in clips)  # of the list up to each clip
         listed = len([size for size in sizes if size <= _LONGEST_LIST])
         if listed < len(clips):
+            # A problem that `_files` has met meanwhile counts first.
             self.problem = self.problem or f"only the first {listed} of {len(clips)} are listed"
         return clips[:listed]
 

@@ -49,7 +49,7 @@ class Backlog:
         self.waiting: dict[str | int, Message] = {}  # retained ones by topic, the others by number
         self._numbers = itertools.count()
         self._live_bytes = 0  # of the messages that are not retained,
-        self._live = 0  # and their number
+        self._live = 0  # and how many these are
 
     def __bool__(self) -> bool:
         return bool(self.waiting)

@@ -331,7 +331,7 @@ class Reader:
         if body[1]:
             self._listener.on_refused(body[1])
             return
-        values = properties(body[2 : 2 + self._properties_size(body)])
+        values = properties(body[2 : 2 + self._properties_size(body)])  # by their numbers; below in Accepted's order
         accepted = Accepted(*map(values.get, (_MAXIMUM_PACKET, _RECEIVE_MAXIMUM, _MAXIMUM_QOS, _RETAIN_AVAILABLE)))
         if accepted.receive_maximum is not None:
             self._quota.begin(accepted.receive_maximum)

@@ -133,7 +133,7 @@ class ZenohTransport(Transport):
         self._hub.watch.close()
         with self._hub.lock:
             session = self._session
-        if session is not None and self._pid == os.getpid():
+        if session is not None and self._pid == os.getpid():  # a fork cannot use the session
             self._publish_will_and_leave(session, will)
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(OPEN_SYNC_S + HUB_ANSWER_S)

@@ -44,7 +44,7 @@ from pebble.version import __version__
 _UNCHECKED = "?"  # behind a name that the broker has not checked
 _MOST_BYTES = 8_000_000  # of each of two files
 _NAME, _FILE = 40, 64  # characters
-_STOPS = 256  # names of stops that are remembered: a stop is repeated until it is confirmed; and senders of lights
+_REMEMBERED = 256  # names of stops, as a stop is repeated until it is confirmed; and as many senders of lights
 _REFUSED = {
     *(Drop.UNNAMED, Drop.MISNAMED, Drop.UNREADABLE, Drop.SIGNED, Drop.LATE),
     *(Drop.STALE, Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN),
@@ -80,7 +80,7 @@ class Audit(Observer):
         self._holder: ControlState | None = None  # None: not known yet
         self._owners, self._awaited = config.motor_owners, set[str]()  # those that have not answered the newest reset
         self._refusals = dict[str, str | None]()  # by owner: why it has refused its last reset, if it has
-        self._stops = deque[tuple[str, str]](maxlen=_STOPS)  # those that have a row: name and sender
+        self._stops = deque[tuple[str, str]](maxlen=_REMEMBERED)  # those that have a row: name and sender
         self._lights = dict[tuple[str, bool], float]()  # when each sender last sent lights, on or off
 
     def start(self) -> None:
@@ -159,7 +159,7 @@ class Audit(Observer):
         if row["what"] == "lights":
             key, now = (who, row["on"]), self._clock()
             last_at = self._lights.pop(key, -math.inf)
-            if len(self._lights) >= _STOPS:
+            if len(self._lights) >= _REMEMBERED:
                 self._lights.pop(next(iter(self._lights)))  # the one that rests longest
             self._lights[key] = now
             return now - last_at < WINDOW_S

@@ -96,7 +96,10 @@ class PageClock:
         return min(answer.highest_offset_s for answer in self._answers)
 
     def _check(self, lowest_offset_s: float, highest_offset_s: float) -> None:
-        """Raise ClockJumpError if these limits of the offset contradict the earlier ones."""
+        """Raise ClockJumpError if these limits of the offset contradict the earlier ones.
+
+        They do if the lowest one is above the earlier highest one, or the highest one below the earlier lowest one.
+        """
         if not self._answers:
             return
         earlier_lowest_s = max(answer.lowest_offset_s for answer in self._answers)

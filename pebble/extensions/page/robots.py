@@ -214,7 +214,7 @@ class Robots:
         self.receive_as(address.identity.base, address.metric, message, now)
 
     def receive_as(self, ref: str, metric: str, message: Message, now: float, channel: c.Channel | None = None) -> None:
-        """Handle a message as if it had come on ``metric``.
+        """Handle a message as if it had come on ``metric`` of component ``ref``: its own topic may name neither.
 
         ``channel``: how to decode it, if the contract does not have it.
         """
@@ -225,7 +225,7 @@ class Robots:
         if channel is c.LOGS:
             self._log(component, message)
             return
-        if not message.payload:
+        if not message.payload:  # a removal, of which the robot's view has to learn as well: see _interpret
             self._remove_value(component, metric)
         trimmed = codec.trim(message.payload)  # pages get it unchanged, inside a JSON message
         if trimmed != message.payload:

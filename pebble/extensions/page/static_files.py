@@ -128,6 +128,7 @@ def root_of(request: Request) -> str:
 
 
 def _packed(name: str, content: bytes) -> bytes | None:
+    """Return the content compressed by gzip; None if its format is compressed already."""
     return None if name.rpartition(".")[2] in _COMPRESSED else gzip.compress(content, 9, mtime=0)
 
 
@@ -139,6 +140,7 @@ def _response(request: Request, name: str, content: bytes, packed: bytes | None,
 
 
 def _read(folder: Traversable, path: str) -> Iterator[tuple[str, bytes]]:
+    """Yield the name and the content of each file; ``path``: what its name begins with."""
     for entry in folder.iterdir():
         suffix = entry.name.rpartition(".")[2]
         if entry.is_dir():

@@ -107,7 +107,7 @@ def make_uplink(
     notifier: Notifier,
     clock: Callable[[], float],
 ) -> Uplink:
-    """Return the uplink of a robot whose link may be thin, or that takes groups of commands."""
+    """Return the uplink of a robot: a thin one if its link may be thin, else a plain one with a gate for groups."""
     if config.services.mqtt_bridge.link.profile != "wide":
         return ThinUplink(config, addresses, remote, forwarder, notifier, clock)
     uplink = Uplink()

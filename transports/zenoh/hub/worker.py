@@ -51,9 +51,9 @@ class HubWorker:
     def serve(self, session: zenoh.Session) -> None:
         """Serve the clients of ``session``, in place of the former session, which is closed."""
         if self._session is not None:
-            self.post(self._await_return)  # its clients get time for that before their wills are published
+            self.post(self._await_return)  # its clients get time to return before their wills are published
         self._session = session
-        # REMOTE: one of the hub's own would wait for room in the queue on the thread that empties this queue.
+        # REMOTE: a message of the hub's own would wait for room in the queue on the thread that empties the queue.
         retain = direct(lambda sample: self._intake.receive(partial(self._store_retained, sample), len(sample.payload)))
         session.declare_subscriber(wire.RETAINED + "**", retain, allowed_origin=zenoh.Locality.REMOTE)
         session.declare_queryable(wire.RETAINED + "**", direct(partial(self._intake.ask, self._query)), complete=True)

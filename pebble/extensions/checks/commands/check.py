@@ -220,7 +220,7 @@ def topics_of(config: Config) -> Iterator[tuple[str, list[TopicLine]]]:
 
 
 def _lines(config: Config, service: str) -> list[TopicLine]:
-    """Return the topics of a service's process: those that a key may rename, and one that is never renamed, if any."""
+    """Return the topics of a service's process: those with a key that may rename them, and one without, if any."""
     addresses = Addresses(config)
     channels = [channel for channel in CHANNELS if _is_of(channel, service) or channel is _NEVER_RENAMED.get(service)]
     if service == "serial_mcu_bridge":

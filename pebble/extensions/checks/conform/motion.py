@@ -85,7 +85,7 @@ def _odometry_wheels(robot: Observer) -> list[tuple[float, list[float]]]:
         value: dict[str, Any] = record.value.value if record.value else {}
         linear: Any = value.get("linear_speed_mps")
         angular: Any = value.get("angular_speed_radps")
-        if _are_speeds([linear, angular]):
+        if _are_speeds([linear, angular]):  # rounded, so that less than 5 mm/s counts as rest
             ahead_mps, turn_mps = round(float(linear), 2), _HALF_TRACK_M * round(float(angular), 2)
             speeds.append((record.at, [ahead_mps - turn_mps, ahead_mps + turn_mps]))
     return speeds

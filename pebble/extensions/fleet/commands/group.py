@@ -369,6 +369,7 @@ def _account(place: Path, fleet: Fleet, name: str) -> Account:
 
 
 def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, *, board: bool = False) -> None:
+    """Print how an account logs in, and what uses it; ``how``: what `applying.apply` has done to admit it."""
     account = fleet.accounts[name]
     if ProgramRole.NEIGHBOUR in account.roles:  # it logs in nowhere: its certificate admits it to the hub
         typer.echo(f"{name} is {account.bases[0]} at the hub of a LAN ({how}).")

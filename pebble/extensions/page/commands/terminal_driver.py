@@ -182,7 +182,7 @@ class TerminalDriver:
         view, situation = self._driven.shown(self._tab, now), self.robot.situation(now)
         situation = situation._replace(
             driven=view.by != "" and not view.you,
-            listening=not view.you,  # this terminal has no control, even if no other person has it
+            listening=not view.you,  # "Take control to drive": a terminal needs control even if no person has it
             stopping=self.stop is not None and not self.stop.finished,
         )
         if not self._heartbeat:

@@ -269,7 +269,7 @@ class DrivenRobot:
         if now - self._sent_at < pace.step_s:  # a thin link carries fewer commands than the page sends
             return [], ""
         self._sent_at = now
-        drive = self._signed(Drive(x=op.x, z=op.z, y=op.y, valid_ms=WIDE.valid_ms))  # on a thin link as `dated` says
+        drive = self._signed(Drive(x=op.x, z=op.z, y=op.y, valid_ms=WIDE.valid_ms))  # `dated` changes it on a thin link
         return [Command(self.ref, pace.dated(drive, now, self._key), pace.qos)], ""
 
     def stop(self, now: float) -> list[Command]:

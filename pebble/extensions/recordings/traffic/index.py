@@ -138,7 +138,7 @@ class _Rows:
         self._count = 0  # of rows in the tables
         self._batch: list[tuple[int, ...]] = []  # rows that are not in the tables yet
         self._activities: dict[int, Callable[[bytes], Activity]] = {}  # by channel
-        self._heartbeats: set[int] = set()  # channels with heartbeats
+        self._heartbeats: set[int] = set()  # the channels with heartbeats
 
     def read(self, recording: Path, advance: Advance) -> tuple[int, str]:
         """Read the recording; return the number of missing messages and the damage. Raises RecordingError."""

@@ -121,6 +121,7 @@ class Follower:
             return self._turn(now, place.angle_rad)
         too_far_m = place.distance_m - self.settings.target_distance_m
         threshold_m = self.settings.distance_threshold_m
+        # It must come nearer to begin holding than to go on holding, so that small errors do not move it to and fro.
         tolerance_m = threshold_m + self.settings.standoff_hysteresis_m if self._holding else _ARRIVED * threshold_m
         self._holding = abs(too_far_m) <= tolerance_m
         if not self._holding:

@@ -251,7 +251,7 @@ class HallWheel:
             added = tracker.update_pair(math.atan2(level, -second), sample.power)
         else:
             added = tracker.update(level, sample.power)
-            if sample.direction == 0:
+            if sample.direction == 0:  # which one sensor alone does not show
                 counts.unknown_rad += abs(added)
                 return
         counts.rad += added

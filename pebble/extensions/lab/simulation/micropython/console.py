@@ -58,6 +58,7 @@ class Console:
             raise KeyboardInterrupt
 
     def take(self, count: int) -> bytearray:
+        """Return the next ``count`` bytes of input, once they have come. Raises KeyboardInterrupt at Ctrl-C."""
         self.check_interrupt()
         typed = self.typed
         while len(typed) < count:

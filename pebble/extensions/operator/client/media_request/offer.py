@@ -56,7 +56,7 @@ def refusal(ref: str, capabilities: dict[str, Any], medium: Medium) -> str:
     if section.get("controls") is not True:
         return words.fixed
     for channel in CHANNELS[medium]:
-        key = PLACES[channel][1]
+        _, key = PLACES[channel]
         if section.get(key) is not None and not names(ref, section[key], channel):
             return f"its capabilities name a topic for {words.name} that is not its own ({key})"
     return ""

@@ -121,7 +121,7 @@ class ViewerRequest:
             return _JOIN_S
         if self._is_up is None:  # :meth:`tick` must know whether to raise the flag
             return _FLAG_S
-        may_be_of_others = self._shares and self._is_up and not self._requested
+        may_be_of_others = self._shares and self._is_up and not self._requested  # if so, a payload comes soon
         return _SLOW_S[self._medium] if may_be_of_others else 0.0
 
     def keyframe(self, encoding: str | None, now: float) -> list[Message]:
