@@ -157,11 +157,18 @@ def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
                 subscribing.join(_ANSWER_S)
                 wait_for(lambda: second.state is State.CONNECTED, _ANSWER_S)
                 _receive(listener, sender, _ON_ITS_WAY_S)
+                since = time.monotonic()  # a robot that has just started says for a moment that it is cut off
+                while _any_cut_off(sender) and time.monotonic() < since + _ANSWER_S:
+                    _receive(listener, sender, _ON_ITS_WAY_S)
         except KeyboardInterrupt:
             sender.end()
         report.end()
-    reaches_motors = not any(is_cut_off(robot.driveable) for robot in sender.robots.values())
-    return 0 if sender.confirmed and reaches_motors else 1
+    return 0 if sender.confirmed and not _any_cut_off(sender) else 1
+
+
+def _any_cut_off(sender: StopSender) -> bool:
+    """True if a robot says that no command reaches its motors."""
+    return any(is_cut_off(robot.driveable) for robot in sender.robots.values())
 
 
 @contextmanager
