@@ -354,7 +354,7 @@ class Trial:
         (self.tree / file).write_bytes(text)
         os.utime(self.tree / file, (0, 0))  # so that no .pyc file is taken for it
         os.dup2(os.open(self.failed, os.O_WRONLY), 1)
-        options = ["--tb=no", "-rfE", f"--maxfail={int(not self.options.matrix)}"]
+        options = ["--tb=no", "-rfE", f"--maxfail={int(not self.options.matrix)}"]  # 0: no limit
         options += [f"--deselect={name}" for name in self.failing]
         os.execv(sys.executable, [sys.executable, "-m", "pytest", *options, *self.arguments])  # noqa: S606
 

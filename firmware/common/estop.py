@@ -93,7 +93,7 @@ class EmergencyStop:
             order = reset_of(load(raw))
         except (ValueError, OverflowError, MemoryError):
             return
-        self.changed = True
+        self.changed = True  # also if it is refused: the state says why
         if order and self.latch.reset(order[0], order[1], 0, now):  # boot, count, and no age: it was read just now
             self._unsaved = True
 

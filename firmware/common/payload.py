@@ -91,7 +91,10 @@ def _run(body: dict, stops: bool) -> int:
 
 
 def _valid_ms(body: dict, stops: bool) -> int:
-    """Return the limit in the command; -1: there is none, or a wrong one in a zero. Raises ValueError, as _run."""
+    """Return the limit in the command; -1: there is none, or a wrong one in a zero. ``stops``: all axes are 0.
+
+    Raises ValueError for a wrong one in a command that moves anything.
+    """
     value = body.get("valid_ms")
     if value is not None:
         if type(value) in (int, float) and 0 <= value < 1e12 and (stops or value >= 1):

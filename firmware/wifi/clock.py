@@ -22,8 +22,8 @@ class Clock:
         self.host = host
         self._wall = sntp.WallClock(now)
         self.read = self._wall.read
-        self._open: Query | None = None  # the DNS query for the server's name; with a nonce, the request to it
-        self._nonce: bytes | None = None
+        self._open: Query | None = None  # the DNS query for the server's name, then the request to the server
+        self._nonce: bytes | None = None  # of the request for the time; None during the DNS query
         self._due = now  # the next query, or since when the present one waits
 
     def step(self, now: int, server: str) -> None:

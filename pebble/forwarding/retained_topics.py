@@ -26,15 +26,15 @@ class RetainedTopics:
         sides: Sides,
         subjects: Subjects,
         publisher: Publisher,
-        winner: Side,
-        both_ways: frozenset[Kind],
+        winner: Side,  # the one whose values count where the two sides differ
+        both_ways: frozenset[Kind],  # the kinds that pass in both directions
         on_value: Callable[[Subject, bytes], None],
     ) -> None:
         self._sides, self._subjects, self._publisher = sides, subjects, publisher
         self._both_ways, self._on_value = both_ways, on_value
         self._lock = threading.RLock()
         self._reconciliation = Reconciliation(winner)
-        self._waiting: dict[str, tuple[Subject, Message, Forward]] = {}
+        self._waiting: dict[str, tuple[Subject, Message, Forward]] = {}  # for the gate to open, by topic
 
     def receive(
         self, source: SideState, subject: Subject, message: Message, forward: Forward, *, only_old: bool = False
@@ -67,7 +67,7 @@ class RetainedTopics:
                 return Drop.CLOSED
             self._reconciliation.receive(Side.LOCAL, message.topic, message.payload, retained=False)
             self._on_value(subject, message.payload)
-            forward = Forward(QoS.DELIVERED, True, subject.kind in URGENT)
+            forward = Forward(QoS.DELIVERED, True, subject.kind in URGENT)  # True: retained
             for side in Side:
                 self._publish(side, subject, message, forward)
             return forward

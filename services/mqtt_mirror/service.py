@@ -72,7 +72,7 @@ class MqttMirror(ForwardingService):
 
     # -- the service's thread
 
-    def connected(self, side: Side, epoch: int) -> None:
+    def connected(self, side: Side, epoch: int) -> None:  # epoch: see ForwardingService
         if side is Side.LOCAL:
             self.forwarder.subscribed(Side.LOCAL)
             self.synchronize_later(Side.LOCAL)
@@ -81,7 +81,7 @@ class MqttMirror(ForwardingService):
             return
         if not self.remote.exact_echo:  # then echo=False is not kept to
             self._refuse('sends our own messages back; use one with bridge mode (mosquitto), or protocol "5"')
-        elif self.forwarder.gate is Gate.OPEN:  # it was checked; the probe shows whether this is another one
+        elif self.forwarder.gate is Gate.OPEN:  # the broker was checked; a probe shows if it is another now
             self.subscribe_remote()
             self._request_probe()
         else:

@@ -81,7 +81,7 @@ class ZenohTransport(Transport):
         self._thread = threading.Thread(target=self._run, name=f"pebble-zenoh {self.client_id}", daemon=True)
         self._thread.start()
         sessions.close_at_exit(self)
-        self._opened.wait(min(timeout, OPEN_SYNC_S))
+        self._opened.wait(min(timeout, OPEN_SYNC_S))  # for the siblings; the caller waits for the hub
 
     def _start_peer(self) -> None:
         presence = self._presence = self._siblings.register(self.client_id)
@@ -258,8 +258,8 @@ class ZenohTransport(Transport):
             if self._session is None:
                 return
             with self._hub.lock:
-                self._hub.renew()
-                self._renew()
+                self._hub.renew()  # answers to earlier queries are dropped
+                self._renew()  # all subscriptions: retained messages are delivered again
             counts = self._synchronize(SYNC_S)  # after _renew: messages received live meanwhile are newer
             self._hub.fetch(self._session, list(self._subscribers), counts)
 

@@ -50,9 +50,9 @@ class Legs:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._robot, self._expected, self._mm_s, self._clock = robot, expected, mm_s, clock
-        self._finder: TagFinder | None = None
+        self._finder: TagFinder | None = None  # None: no tag is watched
         self._tag_id = 0
-        self._picture: Any = None
+        self._picture: Any = None  # the newest one that was looked at
         self._odometry = Odometry(expected, clock())
         #: Messages from the handlers' threads, with their times; :meth:`_wait` handles them on the thread that drives.
         self._inputs: queue.SimpleQueue[tuple[Callable[..., None], Any, float]] = queue.SimpleQueue()

@@ -105,7 +105,7 @@ def _doubted(payload: bytes) -> bytes:
     claim = body.get("by")
     if not isinstance(claim, str) or not claim:
         return payload
-    body["by"] = unchecked(claim)
+    body["by"] = unchecked(claim)  # in ``fields``, of which ``body`` is a part
     return _encoder.encode(fields)
 
 
@@ -131,10 +131,10 @@ def _is_group(payload: bytes) -> bool:
 
 
 def _object(payload: bytes) -> dict[str, Any] | None:
-    """Return the JSON object in ``payload`` as every reader of the contract parses it; None if they cannot."""
+    """Return the JSON object in ``payload`` as every reader of the contract parses it; None if there is none."""
     try:
         usual = payload[:1] == b"{" and payload[-1:] == b"}" and len(payload) <= _USUAL_BYTES
-        if usual and payload.isascii() and b"\0" not in payload:  # the fast way to the same result
+        if usual and payload.isascii() and b"\0" not in payload:  # the fast way to the same result; a NUL ends the JSON
             fields = _decoder.decode(payload)
         else:
             fields = codec.plain(DRIVE, payload)  # reads the JSON of any channel

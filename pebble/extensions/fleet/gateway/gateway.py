@@ -227,7 +227,7 @@ class Gateway:
             return
         base = address.identity.base
         if message.retain:
-            may_be_live = self._hub.as_published  # then live heartbeats are marked so, too
+            may_be_live = self._hub.as_published  # then a live heartbeat has the flag, too, as it was published with it
             if not (may_be_live and self._differs(base, payload)):
                 return
         if base in self._heard or len(self._heard) < MAX_ROBOTS:

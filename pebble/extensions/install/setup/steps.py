@@ -200,6 +200,7 @@ class Job:
         """Yield the steps that end the robot's own broker, and write the certificate of another broker's authority."""
         broker_conf = self.places.broker
         if broker_conf.exists():
+            # False: it is not done yet, as the file exists.
             yield Step("the robot's own broker ends", lambda: False, broker_conf.unlink, (BROKER_SERVICE,))
         if self.answers.broker_ca in (None, self.earlier.broker_ca):
             return

@@ -138,6 +138,7 @@ def cpu_table(results: Results, cells: Sequence[Cell]) -> Table:
     """Return the CPU time for each forwarded message."""
     grid = plain_table("CPU for each forwarded message, µs: median (minimum to maximum) of the rounds",
                         ["load", "process", "variant", "", f"to {STAND_IN}"], left=3, caption=RATIOS)  # fmt: skip
+    # by all parameters, which cells_of gives in this order
     for (load, process), group in grouped(cells, lambda cell: tuple(cell.params.values())).items():
         for ours in group:
             base = results.find(STAND_IN, CPU, load=load, process=process)

@@ -249,6 +249,7 @@ class PlayedRobot:
             payload = harmless(payload, self._ref, self._replayed)
         elif (channel := _LIVENESS.get(metric)) is not None:
             retained = message.channel.metadata.get("retained") == "1"
+            # A recording has one clock: it stands for the monotonic one and for the time of day.
             self._robot.receive(channel, Message(message.channel.topic, payload, retain=retained), received, received)
         try:
             payload = shown(c.channel_of(f"{Direction.OUTGOING}/{metric}"), payload, msgspec.json.decode(payload))

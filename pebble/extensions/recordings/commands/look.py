@@ -127,6 +127,7 @@ def _looked_at(
                 unread.append(str(error))
             if info.problem:
                 unread.append(f"{path}: {info.problem}")
+            # A file without messages has no times, and is in the list of any period.
             if info.first_ns < until_ns and (info.last_ns >= since_ns or not info.messages):
                 looked.append(info)
             advance(number)

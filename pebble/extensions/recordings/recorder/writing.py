@@ -53,7 +53,7 @@ class Context(NamedTuple):
 
 
 class Writing:
-    """A writer of a recorder's messages. Not thread-safe."""
+    """A writer of a recorder's messages, each into the file of its lane (see .lane). Not thread-safe."""
 
     def __init__(self, context: Context, intake: Intake, background: Background) -> None:
         self._folder, self._options, self._clock, self._counters, about = context
