@@ -200,7 +200,7 @@ class FrameReader:
             self.counters.add("skipped", skipped)
 
     def _missed(self, info: FrameInfo) -> int | None:
-        """Return how many frames were lost before this frame; None if this frame is an old one."""
+        """Note a frame as the newest one; return how many were lost before it. None if it is an old one."""
         writer, number = self._newest
         if info.writer == self._replaced:
             return None
