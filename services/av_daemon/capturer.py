@@ -92,6 +92,7 @@ class Capturer:
             source.close()
 
     def _pump(self, source: Source) -> None:
+        """Deliver the frames of an open device, until :meth:`end`, or until there was no reader for ``rest_s``."""
         had_reader_at = time.monotonic()
         while not self._ended.is_set():
             now = time.monotonic()

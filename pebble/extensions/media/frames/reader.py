@@ -226,7 +226,7 @@ class FrameReader:
             self._seen.add(writer_id)
             self.counters.add("writers")
         self.running.add(writer_id)
-        if new and size and self._lacked_room:  # this writer has found room: so may the reader
+        if new and size and self._lacked_room:  # this writer shares memory, so it has found room: so may the reader
             self._lacked_room = False
             self._reopen_soon("")
         if size and self.shared and (problem := self._why_not_map(size, segment)):
