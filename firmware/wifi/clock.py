@@ -53,7 +53,7 @@ class Clock:
             address = self._open.address(now)
             if address:
                 self._close(now)
-                self._nonce = random.getrandbits(32).to_bytes(4, "big") * 2
+                self._nonce = random.getrandbits(32).to_bytes(4, "big") * 2  # 8 bytes, from 32 bits at most
                 self._open = Query(address, 123, sntp.request(self._nonce), now)
             elif address is not None or age >= _LOOKUP_MS:  # "": the name has no address
                 self._close(add(now, _RETRY_MS))

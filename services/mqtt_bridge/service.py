@@ -279,7 +279,7 @@ class MqttBridge(ForwardingService):
             self.forwarder.sides[Side.LOCAL].subscribing()
             self.subscribe_local()
             self.forwarder.subscribed(Side.LOCAL)
-        self.subscribe_remote()
+        self.subscribe_remote()  # only now; the local side is subscribed to while the gate is WAITING
         self.log.info("forwarding between the robot and its remote side")
 
     def found_one_broker(self) -> None:

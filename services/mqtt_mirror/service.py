@@ -157,6 +157,7 @@ class MqttMirror(ForwardingService):
         return () if addressed else (payload,)
 
     def receive_local(self, message: Message) -> None:
+        """Forward a message; notice probes of the bridge. Its heartbeats stay here: it alone publishes them."""
         if message.topic not in self._watched:
             self.forwarder.receive(Side.LOCAL, message)
         elif message.topic == self._probe_topic:
@@ -165,7 +166,6 @@ class MqttMirror(ForwardingService):
                 self._announced = True
                 if self._probes.announce(message.payload):  # it came from the broker before: that is the remote one
                     self.shut()
-        # else a heartbeat: only the bridge publishes it; one from the broker is a reason to request a probe
 
     def receive_remote(self, epoch: int, message: Message) -> None:
         if message.topic in self._watched:

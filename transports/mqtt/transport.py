@@ -312,7 +312,7 @@ class MqttTransport(Transport):
         self._dialler.stalled = False
 
     def _query_own(self, connection: Connection, stopping: threading.Event) -> set[str]:
-        """Return the topics of our retained messages that the broker has, so that they need not be sent again.
+        """Return the topics of our retained messages that are not sent again: the broker has ours, or rightly another.
 
         Sets ``went_back`` if it has another value on a topic that only we publish on: an older one. All values have
         arrived when a ping is answered, because they have QoS 0.
@@ -328,7 +328,7 @@ class MqttTransport(Transport):
         differing = {topic for topic, payload in retained.items() if payload != messages[topic].payload}
         older = differing - may_differ
         self.went_back = bool(older)
-        return retained.keys() - older  # with those that may differ: there ours is not sent again
+        return retained.keys() - older  # an older one is replaced by ours
 
     def _find(self, connection: Connection, topics: list[str], stopping: threading.Event) -> dict[str, bytes]:
         """Return the payloads that the broker retains on these topics."""

@@ -160,7 +160,7 @@ class ZenohTransport(Transport):
     def _run(self) -> None:
         if self.settings.client and not self._start_client():
             return
-        version = 0  # of the newest view that was handled
+        version = 0  # of the newest HubView (which hubs are present) that was handled
         linked = 0  # the number of the hub connection that works; 0: none does, and with a hub it is tried again
         self._wait_for_siblings_once()
         watch = self._hub.watch  # of this run: it is closed at the end, and replaced when the transport opens again

@@ -181,7 +181,7 @@ class Legs:
         return place is not None and abs(place.angle_rad - start.angle_rad) < _AT_TAG_RAD
 
     def _sight(self, max_age: float = 0.3) -> Place | None:
-        """Return the place of the tag in a picture of the last ``max_age`` seconds; None if it is in none."""
+        """Return the tag's place in a new picture, at most ``max_age`` seconds old; None without a picture or tag."""
         assert self._finder is not None  # noqa: S101 - only a calibration with a tag looks
         self._wait(0.01)
         last_picture, self._picture = self._picture, self._robot.picture(max_age)

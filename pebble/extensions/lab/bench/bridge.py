@@ -76,7 +76,7 @@ def running(variants: Sequence[str], *, reports: bool) -> Iterator[dict[str, Dri
         driven = {kind: stack.enter_context(driven_robot(kind, reports=reports)) for kind in variants}
         for robot in driven.values():
             robot.wait_until_ready()
-        time.sleep(STARTUP_S)
+        time.sleep(STARTUP_S)  # a service that is ready may still have work of its start
         yield driven
 
 

@@ -156,6 +156,7 @@ def _state(info: FileInfo) -> str:
 
 
 def _print_events(paths: Iterable[Path]) -> None:
+    # A recorder's events are in its files of states only.
     events = list(catalogue.events(path for path in paths if ".media." not in path.name))
     if events:
         typer.echo("\nWhat happened to the recording:")

@@ -132,7 +132,7 @@ class Writing:
             self._flush(lane, file)
 
     def rotate(self, *, all_of_them: bool = False) -> None:
-        """Finish the files that are old, large or idle."""
+        """Finish the files that are old or large, and those of media that are idle; or ``all_of_them``."""
         now_ns = self._clock.now()
         for lane, file in self._files.by_lane.items():
             old = now_ns - file.began_ns > self._options.rotate_seconds * 1e9

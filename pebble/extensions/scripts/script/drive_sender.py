@@ -134,7 +134,7 @@ class DriveSender:
         if not self._end and self._tried:
             if self._superseded:
                 self._end = SUPERSEDED
-            elif self._barred_at is not None and now >= self._barred_at + _GRACE_S:  # it was a person
+            elif self._barred_at is not None and now >= self._barred_at + _GRACE_S:  # no newer run: a person barred it
                 self._end = "stopped by an operator"
         return self._end
 
