@@ -212,7 +212,7 @@ def _owner_if_running(path: Path) -> str | None:
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except OSError:  # it runs; or there are no locks here, and nothing of it may be removed
         text = os.pread(descriptor, _OWNER_BYTES, 0)
-        return (text.strip(b"\0") or b"?").decode(errors="replace") if text else ""  # only zeros: the disk is full
+        return (text.strip(b"\0") or b"?").decode(errors="replace") if text else ""  # ?: only zeros, by a full disk
     else:
         if _is_at(path, descriptor):  # else it was removed, and a new process may have the name
             _clear_socket(path.with_suffix(".sock"))

@@ -58,7 +58,7 @@ class Arbiter:
             if moves:
                 return REFUSED
             run = PERSON
-        if lease.refuses(moves, run != PERSON or local, key, "" if local else by, now):
+        if lease.refuses(moves, run != PERSON or local, key, "" if local else by, now):  # scripts here need no key
             return REFUSED
         ours = run != PERSON or not lease.key or lease.holds(key, by)  # no other has control: a zero may end a latch
         if newer(run, self.barred) and run != self._newest:  # it has begun, even if this command is refused

@@ -44,7 +44,7 @@ class Lease:
             self._limit_ms = ms
         elif urgent or not self._held:
             self.take(client, ms, now)
-        elif not self.asker or client[:2] == self.asker[:2]:
+        elif not self.asker or client[:2] == self.asker[:2]:  # the first asker stays, while its request lasts
             self.changed = self.changed or not self.asker
             self.asker = client
             self._wait = ms

@@ -91,9 +91,9 @@ def _run(body: dict, stops: bool) -> int:
 
 
 def _valid_ms(body: dict, stops: bool) -> int:
-    """Return the milliseconds for which a command is valid; -1: none is given, or a wrong one in a zero.
+    """Return the limit in the command; -1: there is none, or a wrong one in a zero. ``stops``: all axes are 0.
 
-    ``stops``: the command is a zero. Raises ValueError for a wrong one in any other.
+    Raises ValueError for a wrong one in a command that moves anything.
     """
     value = body.get("valid_ms")
     if value is not None:

@@ -79,7 +79,7 @@ class Imu:
 
     def _fail(self, now: int) -> None:
         if not self._working:
-            self._log(b"imu_init_failed")
+            self._log(b"imu_init_failed")  # `_start` has set the time of the next try
             return
         self.failed += 1
         self._in_a_row += 1

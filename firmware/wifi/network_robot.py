@@ -171,6 +171,7 @@ class NetworkRobot:
             stops.reset(raw, now)
 
     def _judge(self, raw: memoryview | None, by: str, now: int, grouped: bool) -> None:
+        """Note a drive command of ``by`` if it is admitted, else count it. ``raw``, ``grouped``: see _obey, `parse`."""
         command = None if raw is None else parse(raw, grouped)
         if command:
             x, z, y, run, valid_ms, key = command

@@ -159,7 +159,7 @@ def _config(
     file_class, config_class, rules = _classes(installed)
     reader = Reader(folder, env, rules, notes, file=path, other_forms=True)
     merged = with_instances(written)
-    ignored_keys = extensions.keys_of_missing(installed)  # else they would be unknown keys, as no class has them
+    ignored_keys = extensions.keys_of_missing(installed)  # of ours that do not count here: no class has these keys
     if core_only:
         ignored_keys += [key for extension in available for key in extension.sections]
     root = reader.section(file_class, without(merged, ignored_keys))

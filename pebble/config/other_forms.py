@@ -44,7 +44,7 @@ def reading_of(annotation: Any, kind: Any, metas: list[Meta], raw: Any, default:
     if raw and isinstance(raw, str) and kind not in (int, float):  # a text that is no form of a value is a mistake
         return None
     is_empty = not raw or (raw is True and kind not in (int, float))  # as a number a mere true is a mistake
-    means_default = number == 0 or (is_empty and "exact" not in extra)
+    means_default = number == 0 or (is_empty and "exact" not in extra)  # with "exact" only a 0 does
     if means_default and default is not NODEFAULT:
         return Reading(default)
     if kind not in (int, float) or number is None or "exact" in extra:

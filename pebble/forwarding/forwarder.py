@@ -37,7 +37,7 @@ log = logging.getLogger(__name__)
 
 _LOGGED = 200  # characters of a topic
 _STOP = f"/{ESTOP.metric}".encode()
-_NAMES = (Drop.UNNAMED, Drop.MISNAMED, Drop.UNREADABLE)
+_NAMES = (Drop.UNNAMED, Drop.MISNAMED, Drop.UNREADABLE)  # where senders are checked: these are logged
 _BOUNDS = (Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN, Drop.LATE, Drop.CIRCULATES, Drop.SIGNED, *_NAMES)
 _WARNED = (Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN)
 
@@ -351,7 +351,7 @@ class Forwarder:
             payloads = list(self._pass_stop(source.side, message.payload))
             for payload in payloads:
                 self.publisher.publish(target, subject, Message(message.topic, payload, message.qos), forward)
-            return forward if payloads else Drop.RESET  # reset since that stop; or, in the mirror, it is for one owner
+            return forward if payloads else Drop.RESET  # all were reset since; or the mirror keeps one owner's copy
         if is_event:
             self.publisher.note_return(target, subject, message)
             target.events.send(message)

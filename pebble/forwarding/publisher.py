@@ -99,9 +99,9 @@ class Publisher:
         subject, target = self._subjects[topic], self._sides[side.other]
         if subject is None or not target.connected:
             return
-        # White space behind the topic's value; of a one-shot kind alone, because a copy of a command would run again.
+        # White space behind the topic's value; for a one-shot kind without the value, as a copy of a command would run.
         before = b"" if subject.kind.one_shot else value
-        if subject.kind.one_shot or _is_json(value):
+        if subject.kind.one_shot or _is_json(value):  # of other values white space would be a part
             probe = before + self._cycles.probe(side, topic)
             target.transport.publish(topic, probe, qos=QoS.DELIVERED, urgent=subject.kind in URGENT)
 

@@ -28,7 +28,7 @@ def _starts(mcu: Mcu) -> str:
 
 
 def _drives(mcu: Mcu) -> tuple[str, str]:
-    """Return the judgement of a board. Silence alone is "unknown": some boards are silent by design."""
+    """Return the judgement of a board. Its silence is "unknown", unless it normally sends all the time (`Mcu`)."""
     match mcu.state:
         case "absent":
             return _NO, mcu.why or "there is no such device"

@@ -231,7 +231,7 @@ class ProcessSupervisor:
             self._reactor.watch(child.exited, lambda: self._exited(child))
             return
 
-        def ask() -> None:
+        def ask() -> None:  # repeatedly, as the system has no descriptor: see pebble.runtime.exits
             if has_ended(child.pid):
                 self._exited(child)
             else:

@@ -39,7 +39,7 @@ class Reactor:
             before, self._read_at = self._read_at, now
             passed_s = now - before
             if passed_s > _TURN_S + _STALL_S:
-                self._stood_still_s += passed_s - _TURN_S  # counts as a turn: else a starved process would run no timer
+                self._stood_still_s += passed_s - _TURN_S  # the clock goes on by a turn: else no timer might come due
                 self._on_stall(passed_s)
         return now - self._stood_still_s
 

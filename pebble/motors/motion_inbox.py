@@ -100,10 +100,10 @@ class MotionInbox:
             sender = self._control.sender(request)
             waiting = self._requests.pop(sender, None)
             if len(self._requests) >= _REQUESTS:
-                knows = self._control.knows  # true of the holder, and of who asks first: another gives way
+                knows = self._control.knows  # true of the holder, and of the first that asks: these requests stay
                 del self._requests[next(key for key, received in self._requests.items() if not knows(received.request))]
                 self.dropped += 1
-            waiting_takes_over = waiting is not None and waiting.over  # a renewal must not undo that
+            waiting_takes_over = waiting is not None and waiting.over  # which a renewal of the request must not undo
             over = not request.ends() and (over or waiting_takes_over)
             self._requests[sender] = ReceivedRequest(request, over, now)
             return was_empty

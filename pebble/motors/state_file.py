@@ -132,7 +132,7 @@ class StateFile:
             make_folder(self.path.parent)
             write(self.path, json.dumps(value).encode(), 0o600, PebbleError)
             self._own = OwnFile(self.path)
-            if self.lost:
+            if self.lost:  # written all the same: this container can read it
                 raise PebbleError(f"NOT SAVED: no volume holds {self.path.parent}, so a stop ends with this container")
         except (PebbleError, OSError) as error:
             self._log.log("failed", logging.ERROR, "the state cannot be written: %s", error)

@@ -173,7 +173,7 @@ def _renamed_vital(config: Config) -> tuple[str, ...]:
 
 def _renamed(config: Config) -> Iterator[tuple[c.Channel, str]]:
     """Yield the channels that this config renames, and their topics, for every serial line."""
-    section = config.services.serial_mcu_bridge  # of all lines; in the process of one line that line's
+    section = config.services.serial_mcu_bridge  # of all lines; a process of one line has its own section here
     for line in (section, *config.serial_instances().values()):
         addresses = Addresses(replace(config, services=replace(config.services, serial_mcu_bridge=line)))
         for channel in c.CHANNELS:

@@ -206,13 +206,14 @@ class Catalogue:
         if not ours or not self._asks:  # this catalogue never runs a script
             return _Answer(described, ours, problem)
         if not asks:  # it is ours, and is asked later
-            return _Answer(described, True, problem, asked=False)
+            return _Answer(described, ours, problem, asked=False)
         command = self._command(folder, entry, section, described, ours=True)
         try:
             answer = ask(command, folder, environment(section.env))
-            return _Answer(_merged(described, answer), True, problem, drives=answer.drives)
+            return _Answer(_merged(described, answer), ours, problem, drives=answer.drives)
         except DescribeError as error:
-            return _Answer(described, True, str(error), isinstance(error, BrokenScriptError))
+            is_broken = isinstance(error, BrokenScriptError)
+            return _Answer(described, ours, str(error), is_broken)
 
     def _command(
         self, folder: Path, entry: Path, section: ScriptSection, described: Description, *, ours: bool

@@ -88,9 +88,11 @@ class MotorOwners:
             if state.latched or (state.boot == boot and state.count != count):
                 return _stopped(owner, state)
             # An owner bars all runs up to a number: that before a run that begins, or the newest as a person drives.
+            # The number in ``baseline`` it had barred before this run began.
             is_barred = state.last_barred != barred and not newer(run, state.last_barred)
             if signs and is_barred:
-                newer_began = state.last_barred != run or newer(self.newest_run, run)  # it is barred, or was received
+                # A newer run has begun if one is barred, or a command of one was received.
+                newer_began = state.last_barred != run or newer(self.newest_run, run)
                 return SUPERSEDED if newer_began else OVERRIDDEN
             if state.boot != boot:
                 return f"motor owner {owner} was restarted: start the script again"

@@ -99,7 +99,7 @@ class HomeAssistantService(Service):
             return {self._place}
 
     def _save(self, topics: set[str]) -> None:
-        """Save the topics. Without topics the file is removed: this process is then not started next time."""
+        """Save the topics. Without topics the file is removed: a disabled service is then not started next time."""
         if topics == self._retained:
             return
         try:
@@ -109,4 +109,4 @@ class HomeAssistantService(Service):
                 self._file.unlink(missing_ok=True)
         except (OSError, PebbleError) as error:
             self.log.warning("%s: Home Assistant may keep the robot when it is disabled: %s", self._file, error)
-        self._retained = topics
+        self._retained = topics  # even if they are not in the file: this process goes on

@@ -110,7 +110,7 @@ class PassedStops:
                 del self._passed[next(iter(self._passed))]
             waiting = {key for key, owner in self._owners.items() if _waits(owner, name)}  # owners that may lack it
             reset_since = {key for key, owner in self._owners.items() if owner.freed_at > first} - waiting
-            if reset_since:  # a repetition, pending since it came first: only the other owners get a copy
+            if reset_since:  # this repeats a stop that a reset has ended there: only the other owners get a copy
                 return [_addressed(stop, key) for key in self._owners if key not in reset_since]
             for key, owner in self._owners.items():  # of each owner the newest stop stays pending
                 has_newer = owner.pending is not None and owner.pending.first > first

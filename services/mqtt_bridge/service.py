@@ -122,7 +122,7 @@ class MqttBridge(ForwardingService):
     def make_steps(self) -> Mapping[str, Step]:
         return steps_of(self.config)
 
-    def make_names(self) -> Names | None:
+    def make_names(self) -> Names | None:  # the finder of the senders of messages on the remote side
         security = self.config.security
         if not security.named:
             return None
@@ -259,9 +259,9 @@ class MqttBridge(ForwardingService):
             self._open()
         if self.forwarder.gate is Gate.OPEN or not self._same_broker.both_connected:
             return
-        round_ = self._same_broker.begin_round(self.subjects.topics(c.DRIVE)[0])  # which is subscribed to anyway
-        if round_ is not None:
-            wait_s = _PROBE_WAIT_S if self.forwarder.gate is Gate.WAITING else _AGAIN_WAIT_S  # else a probe came back
+        round_ = self._same_broker.begin_round(self.subjects.topics(c.DRIVE)[0])  # for a barrier: subscribed to anyway
+        if round_ is not None:  # else a connection is missing: the next one begins a round
+            wait_s = _PROBE_WAIT_S if self.forwarder.gate is Gate.WAITING else _AGAIN_WAIT_S  # SHUT: a probe came back
             self.call_at(self.clock() + wait_s, partial(self._end_round, round_))
 
     def _end_round(self, round_: int) -> None:
@@ -279,7 +279,7 @@ class MqttBridge(ForwardingService):
             self.forwarder.sides[Side.LOCAL].subscribing()
             self.subscribe_local()
             self.forwarder.subscribed(Side.LOCAL)
-        self.subscribe_remote()
+        self.subscribe_remote()  # only now; the local side is subscribed to while the gate is WAITING
         self.log.info("forwarding between the robot and its remote side")
 
     def found_one_broker(self) -> None:
@@ -419,10 +419,10 @@ class MqttBridge(ForwardingService):
             self.refusals.stale("a command" if channel is None else channel.metric)
             return
         if isinstance(routed.outcome, Drop) and (routed.outcome in _IGNORED or not is_local):
-            return  # a dropped message may be a request only if it is a program's of the robot, and not one of these
+            return  # it may still be a request if a program of the robot sent it, and the reason is none of these
         if channel is None or codec.is_blank(message.payload):
             return
-        if not message.retain and routed.outcome is not Drop.KNOWN:  # observers see what is new
+        if not message.retain and routed.outcome is not Drop.KNOWN:  # observers see what is new, not what is known
             # With a closed gate both sides may be one broker, and the message an operator's.
             by_robot = is_local and self.forwarder.gate is Gate.OPEN
             self._observers.passed(channel, ROBOT if by_robot else routed.by, message.payload)

@@ -414,6 +414,7 @@ class Node:
             self._connect_soon(subscription, source)
 
     def _read(self, subscription: Subscription, source: Source, sock: socket.socket) -> None:
+        """Take what a publisher has sent: first the answer to our header, then messages. Close a lost connection."""
         try:
             chunk = sock.recv(65_536)
             if not chunk:

@@ -138,7 +138,7 @@ class Telemetry:
             self._tell(c.NAVIGATION_GOAL, self._goal, self._names.navigation_goal_topic, read.header)
 
     def _status(self, body: bytes) -> None:
-        """Publish the status of the goal that the planner pursues, or else of the newest; note when it pursues one."""
+        """Note whether a planner pursues a goal, and publish the state of that goal, or of the newest, if it is due."""
         header, goals = messages.goals(body)
         newest = goals[-1] if goals else Goal("", -1, "")
         goal = next((goal for goal in goals if goal.code in _ACTIVE), newest)

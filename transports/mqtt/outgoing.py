@@ -209,7 +209,7 @@ class InFlightTable:
     def first_written(self, now: float) -> dict[str, int]:
         """Return by topic the size of the largest recent message that may be why the broker closed the connection.
 
-        It has accepted all before an answered ping: so only one on another topic, or a larger one, may be the reason.
+        It has accepted all before an answered ping: so only the first on a topic, or the first so large, may be it.
         """
         sizes: dict[str, int] = {}
         for written in [*(ping.written for ping in self._pings), self._written]:

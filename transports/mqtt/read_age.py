@@ -67,7 +67,7 @@ class BrokerDelay:
 
     def __init__(self) -> None:
         self._pings: deque[_Ping] = deque()  # oldest first
-        self._read_answer = self._delivered_answer = 0.0, 0.0  # ping sent at, took; the second as at `delivered`
+        self._read_answer = self._delivered_answer = 0.0, 0.0  # when its ping was sent, and how long it took
         self._shortest = _FAR_S
         self._newest = 0.0  # seconds that the newest answer took; 0: it tells nothing
         self._came_at = 0.0  # when something was received last
@@ -134,7 +134,7 @@ class BrokerDelay:
         """
         since = sent_at = now
         for ping in self._pings:
-            if ping.clear:  # of those that tell anything, the oldest
+            if ping.clear:  # the oldest one that no other data of ours held up
                 since, sent_at = ping.since, ping.sent_at
                 break
         if self._came_at <= sent_at and now - sent_at > self._shortest + _NOTICED_S:  # nothing came since the ping
@@ -143,7 +143,7 @@ class BrokerDelay:
         waited = max(self._newest, now - since, self._stall if now < self._until else 0.0)  # the cases above
         if waited <= self._shortest + _NOTICED_S:
             return 0.0
-        # TCP's present round trip, within bounds: at least the usual one, at most so much longer.
+        # TCP's present round trip, but no less than the usual one, and at most _UPLINK_S more than that.
         way_s = max(self._shortest, min(round_trip_s(), self._shortest + _UPLINK_S))
         return waited - way_s
 

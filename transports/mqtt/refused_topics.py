@@ -47,10 +47,10 @@ class RefusedTopics:
     def __init__(self, client_id: str, vital: tuple[str, ...]) -> None:
         self._client_id, self._vital = client_id, vital
         self._losses: dict[str, int] = {}  # in a row, by topic
-        self.withheld: dict[str, Withheld] = {}
+        self.withheld: dict[str, Withheld] = {}  # by topic: what is not sent, as the broker hangs up
         self._trial: Trial | None = None
         self._quiet_at = -inf  # a trial begins after this time, which is QUIET_S after the newest loss
-        #: Topics on which the broker takes no messages: why, and when that was last in the log.
+        #: Topics that were logged as refused, withheld or not: why, and when that was last in the log.
         self.not_taken = BoundedTable[tuple[str, float]](TOPICS, TOPICS * MAX_BYTES, lambda _: 0)
 
     def accepts(self, message: Message) -> bool:

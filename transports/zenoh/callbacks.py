@@ -60,8 +60,8 @@ class Guard:
         self._warned = False
         self._wakeup, self._lock = Wakeup(), threading.Lock()
         self._thread: threading.Thread | None = None
-        self._calls: list[Calls] = []
-        self._sessions: list[zenoh.Session] = []
+        self._calls: list[Calls] = []  # of the threads that run callbacks
+        self._sessions: list[zenoh.Session] = []  # by which threads are given something to do
 
     def use(self, session: zenoh.Session) -> None:
         """Remember a session, through which a thread can be given work. Any session does: all share Zenoh's threads."""

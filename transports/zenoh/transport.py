@@ -81,7 +81,7 @@ class ZenohTransport(Transport):
         self._thread = threading.Thread(target=self._run, name=f"pebble-zenoh {self.client_id}", daemon=True)
         self._thread.start()
         sessions.close_at_exit(self)
-        self._opened.wait(min(timeout, OPEN_SYNC_S))
+        self._opened.wait(min(timeout, OPEN_SYNC_S))  # for the siblings; the caller waits for the hub
 
     def _start_peer(self) -> None:
         presence = self._presence = self._siblings.register(self.client_id)
@@ -160,7 +160,7 @@ class ZenohTransport(Transport):
     def _run(self) -> None:
         if self.settings.client and not self._start_client():
             return
-        version = 0  # of the newest view that was handled
+        version = 0  # of the newest HubView (which hubs are present) that was handled
         linked = 0  # the number of the hub connection that works; 0: none does, and with a hub it is tried again
         self._wait_for_siblings_once()
         watch = self._hub.watch  # of this run: it is closed at the end, and replaced when the transport opens again
@@ -258,8 +258,8 @@ class ZenohTransport(Transport):
             if self._session is None:
                 return
             with self._hub.lock:
-                self._hub.renew()
-                self._renew()
+                self._hub.renew()  # answers to earlier queries are dropped
+                self._renew()  # all subscriptions: retained messages are delivered again
             counts = self._synchronize(SYNC_S)  # after _renew: messages received live meanwhile are newer
             self._hub.fetch(self._session, list(self._subscribers), counts)
 

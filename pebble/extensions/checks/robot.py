@@ -100,8 +100,8 @@ def state_directory(path: Path) -> CheckResult:
 
 
 def config_of_running(config: Config) -> Iterator[CheckResult]:
-    """Check that no file of the config has changed since the robot was started with it."""
-    lock = config.run_dir() / LAUNCHER_LOCK
+    """Check that the config file has not changed since the robot was started with it."""
+    lock = config.run_dir() / LAUNCHER_LOCK  # which the launcher writes at its start
     if config.path is None or not launcher_runs(config.run_dir()):
         return
     if config.path.stat().st_mtime > lock.stat().st_mtime:

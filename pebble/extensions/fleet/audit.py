@@ -120,5 +120,5 @@ def _take_over(database: sqlite3.Connection) -> None:
     if list(database.execute("PRAGMA table_info(refused)")):
         database.execute(f"INSERT INTO audit ({_COLUMNS}) SELECT {_COLUMNS} FROM refused")  # noqa: S608
         database.execute("DROP TABLE refused")
-    database.execute("DROP TABLE IF EXISTS marks")
+    database.execute("DROP TABLE IF EXISTS marks")  # what it noted of robots' own audits
     database.execute("COMMIT")

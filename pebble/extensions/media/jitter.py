@@ -232,7 +232,7 @@ class JitterBuffer:
         return Chunk(samples, received.rate, received.channels)
 
     def _decode(self, number: int) -> ReceivedSound | None:
-        """Return the sound of a waiting packet; None if it is damaged."""
+        """Return the sound of a waiting packet; None if it is damaged or empty."""
         sound = self._waiting.pop(number)
         self._expected = number % _NUMBERS + 1
         try:

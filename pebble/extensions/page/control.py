@@ -274,7 +274,7 @@ class Control:
 
     def _board(self, op: m.BoardOp) -> None:
         """Allow or end the driving of a board that does not say what it can do, or clear its retained command."""
-        if not self._may("drive" if op.do == "clear" else "system", op):
+        if not self._may("drive" if op.do == "clear" else "system", op):  # to clear changes no permission
             return
         if why := self._server.boards.ask(op, self._session.user):
             self._refuse(op, why)

@@ -87,7 +87,7 @@ class PageClock:
         """True if a message stamped ``t_ms`` by the page may be too old to move anything. Raises ClockJumpError."""
         if not self._answers:
             return True
-        self._check(t_ms / 1000 - now, float("inf"))
+        self._check(t_ms / 1000 - now, float("inf"))  # when it was sent is not known: no limit from above
         oldest_age_s = now - (t_ms / 1000 - self._highest_offset_s())
         usual_s = min(answer.round_trip_s for answer in self._answers)
         return oldest_age_s > min(LATE_S, usual_s + _EXTRA_S)

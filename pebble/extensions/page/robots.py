@@ -266,7 +266,7 @@ class Robots:
             elif has_ages and waited_s >= turn_s:
                 due.append(component)
         due.sort(key=lambda component: component.refreshed_at)
-        at_once = 1 + min(len(self.components), _REFRESHES_PER_S) // 3
+        at_once = 1 + min(len(self.components), _REFRESHES_PER_S) // 3  # not a quarter, so that a late call catches up
         for component in due[:at_once]:
             self._refresh(component, now)
 
@@ -398,12 +398,12 @@ def _aliases(payload: bytes) -> tuple[str, ...]:
 
 
 def _may_be_alias(metric: str) -> bool:
-    """True if neither the contract nor the server itself defines this metric."""
+    """True if a manifest may declare this metric: neither the contract nor the server itself defines it."""
     family = metric.partition("/")[0]
     return (
         _channel(metric) is None
         and not is_reserved(metric)
-        and family not in ("web", "mcu")
+        and family not in ("web", "mcu")  # of the server itself, and the generic topics of MCUs
         and len(metric) <= _LONGEST_ALIAS
         and all(map(_valid_level, metric.split("/")))
     )

@@ -103,6 +103,7 @@ class StaticFiles:
         """
         if name not in self.files:
             return PlainTextResponse("not found", 404)
+        # Of the number four digits do: any client may send a longer one, and it is added to each import.
         if (query := request.scope.get("query_string", b"")).isdigit():
             content = _IMPORT.sub(lambda statement: self._renewed(name, statement, query[:4]), self.files[name])
             return _response(request, name, content, _packed(name, content), headers)

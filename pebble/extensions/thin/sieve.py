@@ -80,7 +80,7 @@ class Sieve:
             return False
         older = self._waiting.get(topic)
         if older is not None:
-            self._counters.add("thinned" if self._takes(rank, 0) else "shed")  # it is replaced
+            self._counters.add("thinned" if self._takes(rank, 0) else "shed")  # 0: it only asks for room
             self._waiting[topic] = Waiting(rank, subject, message, forward, older.since)
             return True
         if self._is_turn(rank, topic) and self._passes(rank, message):

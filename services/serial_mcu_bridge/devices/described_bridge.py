@@ -360,7 +360,7 @@ class DescribedBridge(SerialService):
             self._peers.forget(uid)
         else:
             self._peers.add(uid, frozenset(claims(manifest).granted), self.clock(), retained=retained)
-            if retained:  # ask its bridge for it; if that does not publish it again in time, _tick removes it
+            if retained:  # ask the device's bridge for the manifest: one that does not come in time, _tick removes
                 self.publish(MCU_COMMAND, {}, uid=uid, name=RESERVED)
         self.aliases.update()
         self._arm()

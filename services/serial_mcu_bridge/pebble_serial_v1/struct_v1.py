@@ -99,8 +99,8 @@ def _value(field: Field, raw: Any) -> Any:
     if field.type is FieldType.F32:
         if not math.isfinite(raw):
             raise PayloadError(f"{field.name} is not a finite number")
-        raw = shortest(raw)
-    if field.plain:
+        raw = shortest(raw)  # the decimal with the fewest digits
+    if field.plain:  # it has neither scale nor offset
         return raw
     return float(f"{raw * field.scale + field.offset:.{_DIGITS}g}")
 

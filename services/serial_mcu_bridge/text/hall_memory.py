@@ -34,7 +34,7 @@ class HallMemory:
         self._size = _HEADER.size + slots * _SLOT.size
         self._number = 0  # of the newest sample
         self._opened: tuple[int, mmap.mmap, memoryview] | None = None  # descriptor, memory, and its words of 8 bytes
-        self._check_at_ns = 0  # when to see whether the memory is still there
+        self._check_at_ns = 0  # when to look next whether the memory's file is still there
         self._problem = ""
 
     def write(self, at_ns: int, values: tuple[int, int, int], charging: bool | None) -> None:

@@ -133,7 +133,7 @@ class MotorBridge(MotorOwner, SerialService):
                 self.note_report(is_known(report))
                 self._report(report)
             if self._hall is not None:
-                self._keep_samples(self._hall, reports)  # last: they are kept with what the line says of the charger
+                self._keep_samples(self._hall, reports)  # last, as it needs what this line says of the charger
         self.count_discarded(self._splitter.discarded_lines)
 
     def _keep_samples(self, hall: HallMemory, reports: list[Report]) -> None:

@@ -47,7 +47,7 @@ class ZenohHub:
             from pebble.transports.credentials import renewed_context  # ssl, which few hubs need
 
             self._certificates = renewed_context(settings.tls)
-        self._used = self._newest  # the certificates and rules of the session
+        self._used = self._newest  # the certificates and rules of the session: first those in the files now
 
     @property
     def retained(self) -> dict[str, bytes]:

@@ -67,7 +67,7 @@ def received(robot: RobotUnderTest, medium: Medium, device: str) -> CheckResult:
 
 def stop(robot: RobotUnderTest) -> CheckResult:
     """Check that an operator's stop is confirmed; then end exactly this stop from the robot's own side."""
-    before = {owner: state.recent for owner, state in robot.view.estop.states.items()}
+    before = {owner: state.recent for owner, state in robot.view.estop.states.items()}  # names of the newest stops
     side, name = robot.commanding_side, new_name()
     sender = StopSender(name, by=robot.by, why=_WHY, now=time.monotonic(), robots=[robot.config.base])
     stopped = sender.robots[robot.config.base]
@@ -88,7 +88,7 @@ def stop(robot: RobotUnderTest) -> CheckResult:
     if took_s is None:
         text = f"NOT CONFIRMED after {_CONFIRMED_S:g} s: {why}"
         return failed(text, "pebble doctor CONFIG; pebble estop CONFIG")
-    if is_cut_off(robot.view.driveable):
+    if is_cut_off(robot.view.driveable):  # it confirms, and says itself that nothing reaches the motors
         return failed(f"{robot.view.name} is latched; {doubt_of(robot.view.driveable, stopped=True)}", _LOG)
     sender_side = "its own side" if side.own else "operators"
     return ok(f"confirmed {took_s:.2f} s after {sender_side} sent it, and ended by name")

@@ -182,9 +182,9 @@ def _write_boards(place: Path, fleet: Fleet, boards: list[str], passwords: dict[
         piece = pieces.of_broker(fleet, name, passwords[name], board=True)
         piece["robot"]["platform"] = "esp32"
         _write(_folder_of(place, name) / f"{name}.json", piece)
-    gateway = pieces.boards_file(fleet, GATEWAY, "")
+    gateway = pieces.boards_file(fleet, GATEWAY, "")  # "": the certificates are in the file's own folder
     for neighbour in gateway["neighbours"].values():
-        neighbour["shares"] = list(_SHARED)
+        neighbour["shares"] = list(_SHARED)  # the metrics that others receive of this board
     _write(place / GATEWAY_FILE, gateway)
     write(place / f"{GATEWAY}-password", f"{passwords[GATEWAY]}\n".encode(), 0o600, FleetError)
 

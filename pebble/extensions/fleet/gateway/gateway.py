@@ -227,21 +227,21 @@ class Gateway:
             return
         base = address.identity.base
         if message.retain:
-            may_be_live = self._hub.as_published  # then live heartbeats are marked so, too
-            if not (may_be_live and self._differs(base, payload)):
+            may_be_live = self._hub.as_published  # then a live heartbeat has the flag, too, as it was published with it
+            if not (may_be_live and self._differs_from_first(base, payload)):
                 return
         if base in self._heard or len(self._heard) < MAX_ROBOTS:
             self._heard[base] = self._clock()
         else:
             self._quiet_log.warning("many", "the hub has more than %d robots: give it accounts", MAX_ROBOTS)
 
-    def _differs(self, base: str, heartbeat: bytes) -> bool:
-        """True if the robot's first heartbeat was a different one, so that this one is live.
+    def _differs_from_first(self, base: str, heartbeat: bytes) -> bool:
+        """True if the robot's first heartbeat was a different one, so that this one is live. Stores the first one.
 
         Needed where a transport cannot tell live messages from retained ones.
         """
         if base not in self._first and len(self._first) >= MAX_ROBOTS:
-            self._first.clear()
+            self._first.clear()  # costs a robot one heartbeat
         return self._first.setdefault(base, heartbeat) != heartbeat
 
     def _on_gateway(self, message: Message) -> None:

@@ -47,7 +47,7 @@ class Tools:
         """Return the tool's output. Raises PebbleError with its last lines if it fails. Commands contain no secrets."""
         line = [*self._programs[command.tool], *command.arguments]
         try:
-            if command.loud:
+            if command.loud:  # its output goes directly to the user
                 result = subprocess.run(line, stdin=subprocess.DEVNULL, timeout=timeout_s, check=False)
                 done = Finished(result.returncode, "", "")
             else:

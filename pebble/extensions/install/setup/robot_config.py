@@ -65,7 +65,7 @@ def changed(current: dict[str, Any], before: dict[str, Any], after: dict[str, An
             result[key] = changed(present, old or {}, new or {})
         elif key in after:
             result[key] = new
-        elif present == old:
+        elif present == old:  # setup writes it no longer, and no person has changed it
             result.pop(key, None)
     return result
 

@@ -150,6 +150,7 @@ class Job:
             yield self._file("password of the robot at its broker", file, f"{typed}\n".encode())
         if self.answers.broker == HERE:
             # Without a config the file is of an unfinished setup; with one, it may be of the broker before this one.
+            # The page's file is of this broker only.
             keeps_password = self.config is None or self.has_login
             yield self._new_password("password of the robot at its own broker", file, known=keeps_password)
             if self.answers.page:
@@ -200,6 +201,7 @@ class Job:
         """Yield the steps that end the robot's own broker, and write the certificate of another broker's authority."""
         broker_conf = self.places.broker
         if broker_conf.exists():
+            # False: it is not done yet, as the file exists.
             yield Step("the robot's own broker ends", lambda: False, broker_conf.unlink, (BROKER_SERVICE,))
         if self.answers.broker_ca in (None, self.earlier.broker_ca):
             return

@@ -76,7 +76,7 @@ def running(variants: Sequence[str], *, reports: bool) -> Iterator[dict[str, Dri
         driven = {kind: stack.enter_context(driven_robot(kind, reports=reports)) for kind in variants}
         for robot in driven.values():
             robot.wait_until_ready()
-        time.sleep(STARTUP_S)
+        time.sleep(STARTUP_S)  # a service that is ready may still have work of its start
         yield driven
 
 
@@ -138,6 +138,7 @@ def cpu_table(results: Results, cells: Sequence[Cell]) -> Table:
     """Return the CPU time for each forwarded message."""
     grid = plain_table("CPU for each forwarded message, µs: median (minimum to maximum) of the rounds",
                         ["load", "process", "variant", "", f"to {STAND_IN}"], left=3, caption=RATIOS)  # fmt: skip
+    # by all parameters, which cells_of gives in this order
     for (load, process), group in grouped(cells, lambda cell: tuple(cell.params.values())).items():
         for ours in group:
             base = results.find(STAND_IN, CPU, load=load, process=process)

@@ -273,6 +273,7 @@ class Operator:
     # -- a step, an emergency stop, and a script
 
     def _perform(self, step: Step) -> None:
+        """Set the lights of all robots, drive them for a while, and let them rest."""
         began = time.monotonic()
         channel = c.LIGHTS_FLASH if isinstance(step.lights, LightsFlash) else c.LIGHTS_SOLID
         lights = codec.encode(channel, step.lights)
@@ -280,7 +281,7 @@ class Operator:
             self._publish(robot.topic(channel), lights)
         released = self._hold(step.drive, step.drive_s)
         if step.sends_stop:
-            released = self._drive(STOP)
+            released = self._drive(STOP)  # a zero: from now on they must rest
         self._wait(step.rest_s)
         self._complete(step.name, step.drive, began, released, time.monotonic())
 

@@ -172,8 +172,8 @@ class Testbed(Processes):
 
         Raises PebbleError if a broker fails.
         """
-        names = "remote-broker", "freds-broker"
-        self.remote_broker, self.local_broker = (self.broker(name, program=program) for name in names)
+        broker_names = "remote-broker", "freds-broker"
+        self.remote_broker, self.local_broker = (self.broker(name, program=program) for name in broker_names)
         for broker in (self.remote_broker, self.local_broker):
             broker.wait(self._ending)
         self.broker_port = self.remote_broker.port

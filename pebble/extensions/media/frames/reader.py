@@ -200,7 +200,7 @@ class FrameReader:
             self.counters.add("skipped", skipped)
 
     def _missed(self, info: FrameInfo) -> int | None:
-        """Return how many frames were lost before this frame; None if this frame is an old one."""
+        """Note a frame as the newest one; return how many were lost before it. None if it is an old one."""
         writer, number = self._newest
         if info.writer == self._replaced:
             return None
@@ -226,7 +226,7 @@ class FrameReader:
             self._seen.add(writer_id)
             self.counters.add("writers")
         self.running.add(writer_id)
-        if new and size and self._lacked_room:  # this writer has found room: so may the reader
+        if new and size and self._lacked_room:  # this writer shares memory, so it has found room: so may the reader
             self._lacked_room = False
             self._reopen_soon("")
         if size and self.shared and (problem := self._why_not_map(size, segment)):

@@ -34,7 +34,7 @@ class StreamNames:
         self.socket = folder / f"frames-{stream}.sock"
         self.data = f"frames/{stream}/data"
         self.readers = f"frames/{stream}/reader/*"
-        self.writers = f"frames/{stream}/writer/*/*/*"
+        self.writers = f"frames/{stream}/writer/*/*/*"  # id, size and segment, see writer()
         self.folder, self.stream = folder, stream
         self._lock_name = f"frames-{stream}.{{}}.life"
 

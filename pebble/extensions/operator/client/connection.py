@@ -65,7 +65,7 @@ def connected(target: Target) -> Iterator[tuple[Transport, Names]]:
         if transport.state is not State.CONNECTED:
             why = transport.problem or f"no answer within {OPEN_TIMEOUT_S:g} s"
             raise TransportError(f"cannot connect to {where}: {why}")
-        not_received = _report_missing(transport)
+        not_received = _report_missing(transport)  # in words
         yield transport, names
         _report_missing(transport, not_received)  # what was subscribed to meanwhile may be refused
 

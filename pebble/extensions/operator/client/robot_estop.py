@@ -140,6 +140,7 @@ class RobotEstop:
         return default if is_of_another(topic, self.base) else topic
 
     def _receive_state(self, owner: str, payload: bytes) -> bool:
+        """Store an owner's state, or remove it if it is empty; return False if there is none to store or remove."""
         if not _valid_level(owner) or len(payload) > _STATE_BYTES:
             return False
         if not payload:

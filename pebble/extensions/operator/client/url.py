@@ -67,7 +67,7 @@ def _mqtt(url: str, password: str | None, ca_cert: Path | None) -> MqttSettings:
         host=parts.host,
         port=port,
         username=parts.user,
-        vital=ALL_VITAL,
+        vital=ALL_VITAL,  # small commands are sent even if the broker hangs up after them, see RefusedTopics
         password=password,
         tls=TlsSettings(ca_cert=ca_cert) if encrypted else None,
     )

@@ -103,7 +103,8 @@ class TerminalDriver:
         self._ticked_at = now
         self._assume(now)
         clock = self._tab.clock
-        clock.echo(clock.ping(now), 1000 * now, now)  # at once: no network is between keys and driver
+        # Answered at once, as no network is between keys and driver: unanswered pings would count as a slow page.
+        clock.echo(clock.ping(now), 1000 * now, now)
         view = self._driven.shown(self._tab, now)
         may_request = self.robot.situation(now).published
         if view.keeps:  # the robot itself decides who drives: nothing is requested before it has published who does

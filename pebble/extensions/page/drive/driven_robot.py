@@ -391,10 +391,11 @@ class DrivenRobot:
         tab.end_until(op.g)
         if tab.moves is self and op.g >= tab.gesture:
             self._on(Event.LETS_GO, now)
-        commands = tab.interrupt(op.g, now)  # of another robot that the page moves
+        commands = tab.interrupt(op.g, now)  # zeros of another robot, if the page moves that by this gesture
         if self._is_assumed:  # while such a board connects anew, only a later zero stops it
             self._repeat_zeros(now)
-        is_release = self.tab is tab and not op.final  # the driver has let go: an interrupted script may resume
+        # Unless it is ``final`` (see DriveOp), the driver has let go: an interrupted script may resume.
+        is_release = self.tab is tab and not op.final
         return [Command(self.ref, self._signed(ZERO) if is_release else FINAL_ZERO), *commands]
 
     def _signed(self, drive: Drive) -> Drive:

@@ -201,7 +201,7 @@ class Drivers:
         """Publish a zero by itself, and then the robot's lights: they must not delay it."""
         ref, qos = command.ref, command.qos
         accepted = self._broker.publish(self._robots.topic(ref, DRIVE), payload, qos=qos, by=by)
-        if ref in self._grouped:  # the same topic again: this replaces a group that still waits for a slow connection
+        if ref in self._grouped:  # a group without lights replaces one that still waits for a slow connection
             self._grouped.remove(ref)
             self._broker.publish(GROUP.topic(ref), joined({DRIVE.metric: payload}), qos=qos, by=by)
         self._publish_lights(ref)

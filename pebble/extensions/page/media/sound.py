@@ -95,6 +95,7 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
         self._end_talk(viewer)
 
     def receive(self, payload: bytes) -> None:
+        """Queue a piece of the robot's sound for each page that can decode it: ``can`` has the encodings."""
         encoding = _encoding(payload)
         if not encoding:
             return
@@ -187,6 +188,7 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
         return [viewer.can for viewer in self.viewers if viewer.can]
 
     def _make_view(self, state: str, why: str, _rate: float, _kbits: float) -> SoundView:
+        """Return the state of the sound for pages, which show rates of pictures only."""
         return SoundView(
             state=state,
             why=why,

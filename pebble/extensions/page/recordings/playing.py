@@ -225,7 +225,7 @@ class PlayedRobot:
         position_ms = self.player.position_ns / 1e6
         rests = self.player.paused and not self._is_new  # after a seek even a paused player has something to show
         is_position_due = not rests and now - self._played_at >= _PLAYED_S
-        if is_position_due or rests != self._rested:
+        if is_position_due or rests != self._rested:  # the page knows another state than the present one
             self._rested = rests
             self._show()
         if not rests and now - self._liveness_at >= _LIVENESS_S and self._robot.live:
@@ -249,6 +249,7 @@ class PlayedRobot:
             payload = harmless(payload, self._ref, self._replayed)
         elif (channel := _LIVENESS.get(metric)) is not None:
             retained = message.channel.metadata.get("retained") == "1"
+            # A recording has one clock: it stands for the monotonic one and for the time of day.
             self._robot.receive(channel, Message(message.channel.topic, payload, retain=retained), received, received)
         try:
             payload = shown(c.channel_of(f"{Direction.OUTGOING}/{metric}"), payload, msgspec.json.decode(payload))

@@ -251,7 +251,8 @@ class RecordingFile:
                 start_ns, end_ns, *_ = CHUNK.unpack(self._read(at + HEAD.size, CHUNK.size))
                 chunk = Chunk(start_ns, end_ns, at, end - at, channels, messages)
                 self.chunks.append(chunk)
-                if not channels or not channels <= self.channels.keys():  # else no channel in it is new
+                all_known = bool(channels) and channels <= self.channels.keys()  # no channels: an index is damaged
+                if not all_known:
                     self._learn(chunk)
             elif op == Op.METADATA:
                 self._metadata.append(at)

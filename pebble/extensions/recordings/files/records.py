@@ -70,7 +70,7 @@ def unpack_chunk(data: bytes) -> bytes:
 
 
 def record_of(data: bytes) -> McapRecord:
-    """Return the parsed record. Raises DamageError, also for lengths that do not fit exactly (unchecked in a chunk)."""
+    """Return the parsed record. Raises DamageError, also for lengths that do not fit exactly (but not of a Chunk)."""
     from mcap.data_stream import RecordBuilder
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader

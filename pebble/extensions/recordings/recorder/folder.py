@@ -47,6 +47,7 @@ class Entry:
 
     @property
     def is_active(self) -> bool:
+        """True if it is being written, or its recorder was killed."""
         return self.path.name.endswith(ACTIVE)
 
     @property

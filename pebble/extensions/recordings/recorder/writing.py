@@ -53,7 +53,7 @@ class Context(NamedTuple):
 
 
 class Writing:
-    """A writer of a recorder's messages. Not thread-safe."""
+    """A writer of a recorder's messages, each into the file of its lane (see .lane). Not thread-safe."""
 
     def __init__(self, context: Context, intake: Intake, background: Background) -> None:
         self._folder, self._options, self._clock, self._counters, about = context
@@ -132,7 +132,7 @@ class Writing:
             self._flush(lane, file)
 
     def rotate(self, *, all_of_them: bool = False) -> None:
-        """Finish the files that are old, large or idle."""
+        """Finish the files that are old or large, and those of media that are idle; or ``all_of_them``."""
         now_ns = self._clock.now()
         for lane, file in self._files.by_lane.items():
             old = now_ns - file.began_ns > self._options.rotate_seconds * 1e9

@@ -70,7 +70,7 @@ class Rules:
     def __init__(self, options: Options, channels: Iterable[Channel]) -> None:
         """Check the options. ``channels``: the recording's. Raises ReplayError, ConfigError or TransportError."""
         self._options = options
-        Identity(options.system, "robots", "any")
+        Identity(options.system, "robots", "any")  # raises if topics cannot begin with that system
         for filter_ in options.only:
             check_filter(filter_)
         self._remembered_address = lru_cache(maxsize=65_536)(self._find_address)

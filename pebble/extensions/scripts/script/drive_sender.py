@@ -107,8 +107,8 @@ class DriveSender:
         latched = [state for state in states.values() if state.latched]
         self._latched = max(latched, key=lambda state: state.since, default=None)
         last_barred = [state.last_barred for state in states.values()]
-        barring = [run for run in last_barred if not newer(self.run, run)]  # not below this run: they bar it, too
-        if any(run != self.run for run in barring):  # one above it is barred: so a newer run has begun
+        barring = [run for run in last_barred if not newer(self.run, run)]  # this one or newer: they bar it
+        if any(run != self.run for run in barring):  # a newer one is barred: so it has begun
             self._superseded = True
         elif barring and self._barred_at is None:
             self._barred_at = now
@@ -134,7 +134,7 @@ class DriveSender:
         if not self._end and self._tried:
             if self._superseded:
                 self._end = SUPERSEDED
-            elif self._barred_at is not None and now >= self._barred_at + _GRACE_S:  # it was a person
+            elif self._barred_at is not None and now >= self._barred_at + _GRACE_S:  # no newer run: a person barred it
                 self._end = "stopped by an operator"
         return self._end
 

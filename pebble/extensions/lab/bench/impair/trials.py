@@ -124,7 +124,7 @@ class ImpairedRobot:
         try:
             report = msgspec.convert(self.operator.answer(self.limit_s), Report)
         except PebbleError as error:
-            report = Report(problem=str(error))
+            report = Report(problem=str(error))  # raised below, unless an ended program explains it
         if ended := next((program for program in (self.remote, *self.robot.programs) if program.ended), None):
             raise PebbleError(f"{self.subject}: {ended.name} has ended\n{ended.tail()}".rstrip())
         if report.problem is not None:

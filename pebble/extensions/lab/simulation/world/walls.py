@@ -44,7 +44,7 @@ class Floor:
             self._poses[name] = pose
 
     def _free_part(self, name: str, start: Pose, end: Pose, start_clearance_mm: float) -> float:
-        """Return how much of the move is free, 0 to 1, by halving."""
+        """Return how much of the move is free, 0 to 1, by halving. ``start_clearance_mm``: at its start, see _free."""
         free, blocked = 0.0, 1.0
         for _ in range(_HALVINGS):
             middle = (free + blocked) / 2
