@@ -41,13 +41,12 @@ def without_secrets(text: str) -> str:
     if _AT.search(text):
         text = re.sub(r"\S+", _without_login, _LOGIN_WITH_BLANKS.sub(rf"\1{HIDDEN}@", text))
     text = _PAIR.sub(rf"\1{HIDDEN}", text) if "=" in text else text
-    if ":" in text:
-        text = _MEMBER.sub(lambda match: f"{match[match.lastindex or 0]}{HIDDEN}", _HEADER.sub(rf"\1{HIDDEN}", text))
-    return text
+    hidden = rf"\1\2\3{HIDDEN}"  # of the three groups one is not empty
+    return _MEMBER.sub(hidden, _HEADER.sub(rf"\1{HIDDEN}", text)) if ":" in text else text
 
 
 def _without_login(match: re.Match[str]) -> str:
-    """Return a word with stars before its last @: from ``://`` on or, without that, in place of ``NAME:PASSWORD``."""
+    """Return a word with stars before its last @: after ``://``, or in a word without ``://`` for ``NAME:PASSWORD``."""
     word = match[0]
     ats = [at.start() for at in _AT.finditer(word)]
     if not ats:

@@ -40,7 +40,7 @@ def named(payload: bytes) -> bytes:
 
 
 class Pending(Struct, frozen=True):
-    """A stop that an owner has not confirmed. ``first``: when it was first forwarded; ``at``: since when it waits.
+    """A stop that an owner has not confirmed. ``first``: when it first came; ``at``: when the copy that waits came.
 
     ``before``: the owner's state then, if it receives the stop without its name: a greater count confirms it, too.
     """
@@ -76,7 +76,7 @@ class Owner:
                 self.withdrawn_at = now
             return
         self.withdrawn_at = None
-        # A restart proves no reset: its file may be older than the stop. A greater count: stopped between the states.
+        # Not after a restart: an older file may have freed it. A greater count shows a stop between two states.
         was_stopped = (
             earlier is not None and earlier.boot == state.boot and (earlier.latched or state.count > earlier.count)
         )
@@ -102,10 +102,10 @@ class PassedStops:
         return {key: owner.pending for key, owner in self._owners.items() if owner.pending is not None}
 
     def accept(self, payload: bytes, *, nameless: bool = False) -> list[bytes]:
-        """Remember a named stop as forwarded, and let owners confirm it; return the payloads to publish.
+        """Remember a named stop as forwarded, and expect owners to confirm it; return the payloads to publish.
 
+        If owners were reset since it first came, and need not confirm it, only the others get it: a copy for each.
         ``nameless``: the owners receive it from its sender, too, without this name.
-        An owner that was reset after the stop was first forwarded gets a copy only if it has yet to confirm the stop.
         """
         if not payload:
             return [payload]
@@ -115,10 +115,10 @@ class PassedStops:
             first = self._passed.setdefault(name, now)
             if len(self._passed) > NAMES:
                 del self._passed[next(iter(self._passed))]
-            waiting = {key for key, owner in self._owners.items() if _waits(owner, name)}  # owners that may lack it
+            waiting = {key for key, pending in self.pending.items() if pending.stop.stop == name}  # these may lack it
             reset_since = {key for key, owner in self._owners.items() if owner.freed_at > first} - waiting
-            if reset_since:  # a repetition, pending since it came first: only the other owners get a copy
-                return [_addressed(stop, key) for key in self._owners if key not in reset_since]
+            if reset_since:  # this repeats a stop that a reset has ended there: only the other owners get a copy
+                return [_encoded(stop, owner=key) for key in self._owners if key not in reset_since]
             for key, owner in self._owners.items():  # of each owner the newest stop stays pending
                 has_newer = owner.pending is not None and owner.pending.first > first
                 if key not in waiting and not has_newer and not owner.confirms(name):
@@ -134,7 +134,7 @@ class PassedStops:
         """Return the payloads to publish again, on the local side only; call this every ``REPEAT_S``."""
         with self._lock:
             waiting = self.pending.items()
-            return [_addressed(stop.stop, key) for key, stop in waiting if self._owners[key].withdrawn_at is None]
+            return [_encoded(stop.stop, owner=key) for key, stop in waiting if self._owners[key].withdrawn_at is None]
 
     def give_up(self) -> list[tuple[str, EstopCommand]]:
         """End the stops for owners whose state was withdrawn for too long; return them, each with its owner."""
@@ -146,14 +146,6 @@ class PassedStops:
                     self._owners[key].pending = None
                     ended.append((key, pending.stop))
         return ended
-
-
-def _waits(owner: Owner, name: str) -> bool:
-    return owner.pending is not None and owner.pending.stop.stop == name
-
-
-def _addressed(stop: EstopCommand, owner: str) -> bytes:
-    return _encoded(stop, owner=owner)
 
 
 def _encoded(command: EstopCommand, **fields: Any) -> bytes:

@@ -29,7 +29,7 @@ def of_certificate(fleet: Fleet, name: str) -> dict[str, Any]:
     Empty for others. The certificate, its key and the authority's certificate are in the same folder.
     """
     roles = fleet.accounts[name].roles
-    at_hub = _at_hub(fleet, name, certificates.CA_CERT, name)
+    at_hub = _at_hub(fleet, name, certificates.CA_CERT, name)  # its certificate's files have the account's name
     if ProgramRole.HUB in roles:
         return hub_file(name) | {"journal": f"{name}.journal"}
     if ProgramRole.ROBOT in roles:

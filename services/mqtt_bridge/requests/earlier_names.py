@@ -47,8 +47,8 @@ class EarlierNames:
             if folder.name == file_name(config.base):  # by default each name has one of its own
                 folder = folder.parent
             self._file = folder / f"names-{file_name(str(config.path.resolve()))}.json"
-        self._names: list[str] = []
-        self._begun = False
+        self._names: list[str] = []  # as in the file, the present one last
+        self._begun = False  # the search, which is made once
 
     def begin(self) -> None:
         """Remember the robot's name, and look for messages of earlier ones. Call this when both sides are connected."""
@@ -121,11 +121,11 @@ class _Removal:
         if any(len(heartbeats) > 1 for heartbeats in self._answers):  # only one of them can be retained
             log.info("%s is another robot now: what is retained under this name is its own", self._name)
             self._end()
-            self._done()
-        elif all(transport.state is State.CONNECTED for transport in self._sides):  # else at the next start
+            self._done()  # the name is forgotten
+        elif all(transport.state is State.CONNECTED for transport in self._sides):
             self._ask(f"{self._name}/#", _note_retained, _ARRIVE_S, self._remove)
         else:
-            self._end()
+            self._end()  # the name is kept: the next start looks again
 
     def _remove(self) -> None:
         self._removed = sum(map(len, self._answers))
