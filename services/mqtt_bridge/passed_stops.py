@@ -26,11 +26,8 @@ def is_named(payload: bytes) -> bool:
 
 
 def named(payload: bytes) -> bytes:
-    """Return a stop with a name, and without an owner, which only the bridge may add.
-
-    Any payload is a stop but an empty one, which removes a retained message.
-    """
-    if not payload:
+    """Return a stop with a name, and without an owner, which only the bridge may add."""
+    if not payload:  # no stop: it removes a retained message
         return payload
     stop = codec.decode(ESTOP, payload)
     if stop.stop is not UNSET and stop.owner is UNSET:
