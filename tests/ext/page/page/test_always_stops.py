@@ -85,6 +85,13 @@ def test_a_page_that_loses_a_file_stops_robots(
             opened.context.unroute_all(behavior="ignoreErrors")
 
 
+def test_stop_is_red_from_the_first_where_people_choose_all_colours(browser: Browser, server: CannedServer) -> None:
+    server.show(STATES["fleet"])
+    later = {"**/panels.css": lambda route: route.abort(), "**/*.*/panels.css": lambda route: route.abort()}
+    with tab(browser, server.url, routes=later, forced_colors="active") as opened:
+        assert opened.until(_SHOWS)
+
+
 def test_its_stop_is_a_form_that_the_server_takes(browser: Browser, served: Served, robot: RecordingRobot) -> None:
     lost = {"**/main.js": lambda route: route.abort(), "**/*.*/main.js": lambda route: route.abort()}
     with served.page() as other, tab(browser, served.origin, script=_SOON, routes=lost) as opened:
