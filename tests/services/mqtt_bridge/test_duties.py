@@ -18,7 +18,7 @@ from pebble.contract import CHANNELS, GIT_PULL, REBOOT, Kind
 from pebble.runtime.parent import Notifier
 from pebble.services.mqtt_bridge.motor_owners import MotorOwners
 from pebble.services.mqtt_bridge.requests.actions import ACTIONS, Action, Row
-from pebble.services.mqtt_bridge.requests.earlier_names import CallIn, EarlierNames
+from pebble.services.mqtt_bridge.requests.earlier_names import CallIn, EarlierNames, keep_stops
 from pebble.services.mqtt_bridge.vouching import Vouching
 from pebble.transports import Answer, Transport
 from pebble.transports.memory import MemoryHub, MemoryTransport
@@ -245,6 +245,7 @@ class Named:
         for side in sides:
             side.open(5 if connected else 0.5)
         jobs: list[Callable[[], None]] = [meanwhile]
+        keep_stops(load(self.config))
         names = EarlierNames(load(self.config), sides, lambda _seconds, job: jobs.append(job))  # type: ignore[arg-type]
         names.begin()
         while jobs:
@@ -289,6 +290,39 @@ def test_what_was_retained_under_an_earlier_name_is_removed(robot: Named) -> Non
     assert (robot.left, robot.known) == ([], ["rover", "rover-two"])
     robot.start("rover-two")
     assert robot.known == ["rover-two"]
+
+
+STOPPED, FREE = '{"latched": true, "recent": []}', '{"latched": false, "recent": []}'
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "kept"),
+    [(STOPPED, None, STOPPED), ("damaged", FREE, "damaged"), (FREE, STOPPED, STOPPED), (FREE, None, None)],
+)
+@pytest.mark.parametrize("by_name", [False, True])
+def test_a_stopped_robot_stays_stopped_under_another_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: str, now: str | None, kept: str | None, by_name: bool
+) -> None:
+    """``by_name``: its config names no state directory, and each name has one of its own."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "home"))
+    path, transport = (
+        tmp_path / "robot.json",
+        {"kind": "zenoh"} | ({} if by_name else {"state_dir": str(tmp_path / "state")}),
+    )
+    services = {"serial_mcu_bridge": {"enabled": True, "serial": {"port": "/dev/null"}}}
+    files = []
+    for name, content in (("rover", before), ("rover-two", now)):
+        path.write_text(json.dumps({"robot": {"id": name}, "transport": transport, "services": services}))
+        file = load(path).state_file("estop-serial")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        if content is not None:
+            file.write_text(content)
+        keep_stops(load(path))
+        files.append(file)
+    assert (files[1].read_text() if files[1].exists() else None) == kept
+    files[1].unlink(missing_ok=True)
+    keep_stops(load(path))
+    assert not files[1].exists(), "once"
 
 
 def test_what_another_robot_retains_stays(robot: Named) -> None:
