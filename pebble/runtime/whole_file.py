@@ -38,7 +38,7 @@ def set_mode(file: Path, mode: int, opened: Path | int | None = None) -> None:
         if error.errno not in (errno.EPERM, *_NOT_HERE):
             raise
         if os.stat(opened).st_mode & 0o077 & ~mode:  # noqa: PTH116
-            log.warning("%s: others can read it, which cannot be changed here: %s", file, error.strerror)
+            log.error("%s: others can read it, which cannot be changed here: %s", file, error.strerror)
 
 
 def sync_file(descriptor: int, *, data: bool = False) -> None:

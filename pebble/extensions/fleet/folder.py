@@ -168,7 +168,7 @@ def locked(folder: Path) -> Iterator[None]:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX)
         except OSError as error:
-            log.warning("%s cannot be locked (%s): let no other command change it meanwhile", folder, error.strerror)
+            log.error("%s cannot be locked (%s): let no other command change it meanwhile", folder, error.strerror)
         yield
     finally:
         os.close(descriptor)

@@ -100,14 +100,15 @@ def test_what_a_recorder_uses_is_left_alone(folder: Path, run: Run) -> None:
     assert messages(folder) == 201
 
 
-def test_a_share_without_locks_is_recorded_to(
+def test_a_share_without_locks_and_sizes_is_recorded_to(
     folder: Path, run: Run, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     left = folder / "2026/11/20/20261120T232921Z-000999.state.mcap.active"
     left.parent.mkdir(parents=True, exist_ok=True)
     left.write_bytes(b"")
     monkeypatch.setattr("fcntl.flock", refused(errno.ENOLCK))
-    recorder = Recorder(folder, Options(free_bytes=0))
+    monkeypatch.setattr("os.statvfs", lambda _: os.statvfs_result((512, 512, 0, 0, 0, 0, 0, 0, 0, 255)))
+    recorder = Recorder(folder, Options())
     recorder.start()
     recorder.receive(f"{GOOB}/outgoing/online", b'{"t":1}', 1, retain=False)
     recorder.stop()
@@ -115,6 +116,7 @@ def test_a_share_without_locks_is_recorded_to(
     assert (messages(folder), left.exists()) == (202, True)  # what may be another recorder's stays
     assert run("recordings", "rm", left, "--yes") == 1
     assert run("recordings", "rm", folder, "--robot", "fred", "--yes") == 1
+    assert f"pebble: {folder}/recorder.lock cannot be locked" in run.err
     assert messages(folder) == 102
 
 

@@ -94,7 +94,8 @@ def write_copy(messages: Iterable[Recorded], out: File) -> int:
 
 def _copy(source: Path, part: Path, keeps: Keeps, *, complete: bool) -> Rewritten:
     """Write the copy. Raises OSError, and RecordingError if it must be ``complete`` and is not."""
-    if shutil.disk_usage(part.parent).free < source.stat().st_size:
+    room = shutil.disk_usage(part.parent)
+    if room.total and room.free < source.stat().st_size:  # some shares tell no sizes
         raise OSError(errno.ENOSPC, f"there is no room for a copy of {source.name}", str(part.parent))
     left_out = 0
     with RecordingFile(source) as file, part.open("xb", buffering=0) as out:
