@@ -7,6 +7,7 @@ import json
 import logging
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -38,21 +39,31 @@ _TOPICS = 1000  # that are removed of one name
 
 
 def keep_stops(config: Config) -> None:
-    """Remember the robot's name. If it is another one than at the last start, keep the stops of then.
+    """Remember the robot's name, and keep its stops if it or a motor owner had another name at the last start.
 
     Raises PebbleError if a stop cannot be kept.
     """
-    names = _names_of(config)
-    if config.path is None or names[-1:] == [config.base]:
+    if config.path is None:
         return
-    for before in names[-1:]:
-        for owner in config.motor_owners:
-            file = _folder(config, file_name(before)) / f"estop-{owner}-{file_name(before)}.json"
-            saved = _saved(file)
-            if _FREE not in saved:
-                write(config.state_file(f"estop-{owner}"), saved, 0o600, PebbleError)
-                log.warning("%s is stopped, as it was under its earlier name %s", owner, before)
-    _remember(config, [*(name for name in names if name != config.base), config.base])
+    names = _names_of(config)
+    before = names[-1] if names else config.base
+    targets = [config.state_file(f"estop-{owner}") for owner in config.motor_owners]
+    for file in _stop_files(config, before):
+        for target in targets if file not in targets and _FREE not in _saved(file) else ():
+            if before != config.base or not target.exists():  # else the owner knows better
+                write(target, _saved(file), 0o600, PebbleError)
+                log.warning("stopped, as it was before names in the config were changed: %s", file)
+    if before != config.base or not names:
+        _remember(config, [*(name for name in names if name != config.base), config.base])
+
+
+def _stop_files(config: Config, base: str) -> list[Path]:
+    """Return the files that motor owners have saved under this name."""
+    end = f"-{file_name(base)}.json"
+    with suppress(OSError):  # no folder
+        files = [*_folder(config, file_name(base)).iterdir()]
+        return [file for file in files if file.name.startswith("estop-") and file.name.endswith(end)]
+    return []
 
 
 def _names_of(config: Config) -> list[str]:

@@ -296,33 +296,41 @@ STOPPED, FREE = '{"latched": true, "recent": []}', '{"latched": false, "recent":
 
 
 @pytest.mark.parametrize(
-    ("before", "now", "kept"),
-    [(STOPPED, None, STOPPED), ("damaged", FREE, "damaged"), (FREE, STOPPED, STOPPED), (FREE, None, None)],
+    ("names", "before", "now", "kept"),
+    [
+        (("rover", "rover-two"), STOPPED, None, STOPPED),
+        (("rover", "rover-two"), "damaged", FREE, "damaged"),
+        (("rover", "rover-two"), FREE, STOPPED, STOPPED),
+        (("rover", "rover-two"), FREE, None, None),
+        (("serial", "left"), STOPPED, None, STOPPED),
+        (("serial", "left"), STOPPED, FREE, FREE),
+    ],
 )
 @pytest.mark.parametrize("by_name", [False, True])
 def test_a_stopped_robot_stays_stopped_under_another_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: str, now: str | None, kept: str | None, by_name: bool
-) -> None:
-    """``by_name``: its config names no state directory, and each name has one of its own."""
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, by_name: bool,
+    names: tuple[str, str], before: str, now: str | None, kept: str | None,
+) -> None:  # fmt: skip
+    """``names``: of the robot, or of its motor owner. ``by_name``: each robot has a state directory of its own."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "home"))
-    path, transport = (
-        tmp_path / "robot.json",
-        {"kind": "zenoh"} | ({} if by_name else {"state_dir": str(tmp_path / "state")}),
-    )
-    services = {"serial_mcu_bridge": {"enabled": True, "serial": {"port": "/dev/null"}}}
-    files = []
-    for name, content in (("rover", before), ("rover-two", now)):
-        path.write_text(json.dumps({"robot": {"id": name}, "transport": transport, "services": services}))
-        file = load(path).state_file("estop-serial")
-        file.parent.mkdir(parents=True, exist_ok=True)
+    path, files = tmp_path / "robot.json", list[Path]()
+    transport = {"kind": "zenoh"} | ({} if by_name else {"state_dir": str(tmp_path / "state")})
+    line = {"enabled": True, "serial": {"port": "/dev/null"}}
+    for name, content in zip(names, (before, now), strict=True):
+        bridge = {"instances": {"left": line}} if name == "left" else line
+        robot = {"id": name if name.startswith("rover") else "goob"}
+        services = {"serial_mcu_bridge": bridge}
+        path.write_text(json.dumps({"robot": robot, "transport": transport, "services": services}))
+        config = load(path)
+        files.append(config.state_file(f"estop-{config.motor_owners[0]}"))
+        files[-1].parent.mkdir(parents=True, exist_ok=True)
         if content is not None:
-            file.write_text(content)
-        keep_stops(load(path))
-        files.append(file)
+            files[-1].write_text(content)
+        keep_stops(config)
     assert (files[1].read_text() if files[1].exists() else None) == kept
-    files[1].unlink(missing_ok=True)
+    files[1].write_text(FREE)
     keep_stops(load(path))
-    assert not files[1].exists(), "once"
+    assert files[1].read_text() == FREE, "it was reset"
 
 
 def test_what_another_robot_retains_stays(robot: Named) -> None:
