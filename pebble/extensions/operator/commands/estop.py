@@ -34,7 +34,7 @@ from pebble.extensions.operator.client.driveable import Driveable
 from pebble.extensions.operator.client.estop import Progress, RobotStop, StopSender, new_name, send
 from pebble.extensions.operator.client.estop_states import Reset, RobotEstop
 from pebble.extensions.operator.client.heartbeats import Heartbeats
-from pebble.extensions.operator.client.names import id_of
+from pebble.extensions.operator.client.names import id_of, spellings
 from pebble.extensions.operator.client.robot_topics import SYNONYMS
 from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.extensions.operator.commands import show
@@ -130,7 +130,7 @@ def me(account: str | None = None) -> str:
 def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
     """Send stops, and listen on a second connection, so that what arrives delays none of them."""
     with interrupted_by_signals(), connected(target) as (transport, names):
-        robots = None if every else [names.base]
+        robots = None if every else spellings(names.base)
         sender = StopSender(new_name(), by=me(names.account), why=why, now=time.monotonic(), robots=robots, hold=hold)
         put_account_into_topics(
             transport, names, lambda base: base in sender.robots and sender.robots[base].estop.named
@@ -140,12 +140,13 @@ def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
         report = _Report(sender, outbox)
         try:
             with _heartbeats(target, every=every) as heartbeats, listening(target, transport) as second:
-                listener, subscribing = _listen(second, names.base)
+                listener, subscribing = _listen(second, robots or [names.base])
                 while not sender.finished:
                     for message in heartbeats.take() if heartbeats else ():
                         sender.receive(message, time.monotonic())
                     outbox.publish()
                     _receive(listener, sender, _until_due(sender, has_heartbeats=heartbeats is not None))
+                    _drop_other_spelling(sender)
                     outbox.publish()
                     report.connection(
                         "" if transport.state is State.CONNECTED else transport.problem or "no connection"
@@ -175,9 +176,17 @@ def _heartbeats(target: Target, *, every: bool) -> Iterator[Heartbeats | None]:
         yield heartbeats
 
 
-def _listen(transport: Transport, base: str) -> tuple[Listener, threading.Thread]:
+def _drop_other_spelling(sender: StopSender) -> None:
+    """Stop no more the robot whose name only looks like that of the one that was heard."""
+    heard = [base for base, robot in sender.robots.items() if robot.live or robot.estop.has_capabilities]
+    if sender.order.named and heard:
+        sender.robots = {base: sender.robots[base] for base in heard}
+
+
+def _listen(transport: Transport, bases: list[str]) -> tuple[Listener, threading.Thread]:
     """Subscribe on a thread, so that a slow network does not delay the stop; return the listener and the thread."""
-    filters = [channel.filter(base) for channel in (ESTOP_STATE, CAPABILITIES, STATUS, ONLINE, *SYNONYMS)]
+    channels = (ESTOP_STATE, CAPABILITIES, STATUS, ONLINE, *SYNONYMS)
+    filters = [channel.filter(base) for base in bases for channel in channels]
     listener = Listener(transport, ())
 
     def subscribe() -> None:
