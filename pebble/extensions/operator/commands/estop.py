@@ -328,18 +328,20 @@ def _reset(target: Target) -> int:
     Messages of the robot come on a connection of their own if possible, so that they do not delay the reset.
     """
     with connected(target) as (transport, names), listening(target, transport) as receiving:
-        view, name = RobotView(names.base), shown(id_of(names.base))
-        robot = view.estop
+        views = [RobotView(base) for base in spellings(names.base)]
+        for view in views:
+            view.estop.subscribe(receiving)
+        wait_for(lambda: any(view.estop.has_capabilities for view in views), _ANSWER_S)
+        view = next((view for view in views if view.estop.has_capabilities), views[0])
+        robot, name = view.estop, shown(id_of(view.estop.base))
 
         def is_named(base: str) -> bool:
             """True if it is this robot, and it takes commands only at topics with the sender's name."""
             return base == robot.base and robot.named
 
         put_account_into_topics(transport, names, is_named)
-        robot.subscribe(receiving)
         # for ``view.pace``; the times of arrival do not matter
         receiving.subscribe(LINK.topic(robot.base), lambda message: view.receive(LINK, message, 0.0, 0.0), direct=True)
-        wait_for(lambda: robot.has_capabilities, _ANSWER_S)
         receiving.ask(robot.missing)  # stop states: the capabilities that list the owners may just have come
         wait_for(lambda: not robot.missing, _ANSWER_S)
         if not robot.states:

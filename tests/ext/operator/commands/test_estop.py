@@ -283,10 +283,11 @@ def terminal() -> Iterator[tuple[int, int]]:
         os.close(end)
 
 
-def test_a_reset_shows_who_stopped_the_robot_and_frees_it(run: Run, robot_on: Make, url: str) -> None:
-    robot = robot_on("left", "right")
+@pytest.mark.parametrize("id_", ["", "ba\u0308r"])
+def test_a_reset_shows_who_stopped_the_robot_and_frees_it(run: Run, robot_on: Make, url: str, id_: str) -> None:
+    robot = robot_on("left", "right", id_=id_)
     robot.stop(by="ann@desk", why="dog")
-    assert run("estop", "reset", robot.id, url) == 0
+    assert run("estop", "reset", "b\u00e4r" if id_ else robot.id, url) == 0
     lines = run.out.splitlines()
     assert lines[0].startswith(f"{robot.id}: stopped by ann@desk, ")
     assert all(line.endswith(f": dog ({owner})") for line, owner in zip(lines, ("left", "right"), strict=False))
