@@ -100,13 +100,14 @@ def test_what_a_recorder_uses_is_left_alone(folder: Path, run: Run) -> None:
     assert messages(folder) == 201
 
 
-def test_a_share_without_locks_and_sizes_is_recorded_to(
+def test_a_share_without_locks_sizes_and_times_is_recorded_to(
     folder: Path, run: Run, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     left = folder / "2026/11/20/20261120T232921Z-000999.state.mcap.active"
     left.parent.mkdir(parents=True, exist_ok=True)
     left.write_bytes(b"")
     monkeypatch.setattr("fcntl.flock", refused(errno.ENOLCK))
+    monkeypatch.setattr("os.utime", refused(errno.EPERM))
     monkeypatch.setattr("os.statvfs", lambda _: os.statvfs_result((512, 512, 0, 0, 0, 0, 0, 0, 0, 255)))
     recorder = Recorder(folder, Options())
     recorder.start()

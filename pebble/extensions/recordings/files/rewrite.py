@@ -5,6 +5,7 @@ import os
 import shutil
 import stat
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -47,7 +48,8 @@ def rewrite(source: Path, target: Path, *, keeps: Keeps = lambda _message: True)
         _check(part, copy)
         status = source.stat()
         set_mode(part, stat.S_IMODE(status.st_mode))
-        os.utime(part, ns=(status.st_atime_ns, status.st_mtime_ns))
+        with suppress(OSError):  # some shares let only the owner set times
+            os.utime(part, ns=(status.st_atime_ns, status.st_mtime_ns))
         part.replace(target)
     finally:
         part.unlink(missing_ok=True)
