@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 
 from pebble.errors import PebbleError
-from pebble.runtime.whole_file import sync_folder
+from pebble.runtime.whole_file import sync_file, sync_folder
 
 
 def write_new(file: Path, content: bytes) -> None:
@@ -20,7 +20,7 @@ def write_new(file: Path, content: bytes) -> None:
                 raise PebbleError(f"{file}: {why}")
             output.write(content)
             output.flush()
-            os.fsync(descriptor)
+            sync_file(descriptor)
         sync_folder(file.parent)
     except BaseException as error:
         file.unlink(missing_ok=True)
