@@ -88,6 +88,17 @@ def test_one_robot_is_deleted(folder: Path, run: Run) -> None:
     assert "fred" not in run.out
 
 
+def test_a_robot_is_found_by_a_name_that_looks_the_same(tmp_path: Path, run: Run) -> None:
+    recorder = Recorder(tmp_path / "rec", Options())
+    recorder.start()
+    recorder.receive("pebble/robots/ba\u0308r/outgoing/online", b'{"t":1}', 1, retain=False)
+    recorder.stop()
+    assert run("recordings", "search", tmp_path / "rec", "--robot", "b\u00e4r") == 0
+    assert "outgoing/online" in run.out
+    assert run("recordings", "rm", tmp_path / "rec", "--robot", "b\u00e4r", "--yes") == 0
+    assert run.out == "1 messages deleted\n"
+
+
 def test_what_a_recorder_uses_is_left_alone(folder: Path, run: Run) -> None:
     recorder = Recorder(folder, Options(free_bytes=0))
     recorder.start()
