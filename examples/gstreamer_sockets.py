@@ -53,7 +53,7 @@ def offer(path: Path, parser: str, reader: FrameReader, data: Callable[[Frame], 
                 process.stdin.write(data(frame))
                 process.stdin.flush()
     finally:
-        for leftover in SHM.glob(f"shmpipe.{process.pid:5}.*"):
+        for leftover in SHM.glob(f"shmpipe.{process.pid:5}.*"):  # GStreamer writes five characters, blanks first
             leftover.unlink()
 
 

@@ -1,6 +1,7 @@
 """The ``pebble`` command: errors become lines on stderr and an exit code.
 
-0: success. 1: failure, or no result. 2: the command line is wrong. 130: Ctrl-C.
+0: success, also the end by SIGTERM of what runs until then. 1: failure, or no result. 2: the command line is wrong.
+130: Ctrl-C.
 """
 
 import errno

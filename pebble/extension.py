@@ -37,7 +37,7 @@ T = TypeVar("T")
 
 #: The group of entry points by which a package offers an extension.
 ENTRY_POINTS: Final = "pebble.extensions"
-_IMPORT_S = 60.0  # for a stranger's module: large libraries take half of it on a small board
+_IMPORT_S = 60.0  # for a module of others: large libraries take half of it on a small board
 _SECTION_KEY = re.compile(r"(services\.)?[A-Za-z]\w*", re.ASCII)
 #: Our extensions in the order of their sections, with the keys of a config that belong to each. One that others use
 #: stands before them.
@@ -86,7 +86,7 @@ class Stage(IntEnum):
 class Program(Struct, frozen=True):
     """A process: its name in logs and status, and what it runs with ``arguments``.
 
-    That is a service (``module:Class``), or a module, as ``python -m`` does. The launcher imports the module before
+    It runs a service (``module:Class``), or a module as ``python -m`` runs it. The launcher imports the module before
     it forks: importing must do nothing. Import what only some robots need in the functions that use it: then it is in
     the memory of those robots only.
     """
@@ -181,7 +181,7 @@ def ours() -> tuple[Extension, ...]:
         extension = _declared(module)
         if extension is not None and all(need in installed for need in extension.needs):
             installed[extension.name] = extension
-            SERIAL_PROTOCOLS.update(extension.protocols)
+            SERIAL_PROTOCOLS.update(extension.protocols)  # the contract has only the core's
     return tuple(installed.values())
 
 
@@ -213,7 +213,7 @@ def named(
                 _check_parts(extension, section)
         except KeyboardInterrupt:
             raise
-        except BaseException as error:  # noqa: BLE001 - a stranger's module may raise anything, also SystemExit
+        except BaseException as error:  # noqa: BLE001 - a module of others may raise anything, also SystemExit
             missing.append(Missing(name, f"extensions.{name}", _reason(error), drives))
             continue
         if extension.motors and not drives:
@@ -437,9 +437,11 @@ def _of_file(path: Path) -> Extension:
     if not path.is_file():
         raise PebbleError(f"there is no file {path}")
     if hasattr(os, "getuid") and os.getuid() == 0:
-        # Who may write in a folder may replace the file: in that of a link, and in that of the file behind it.
-        folders = (path.parent, path.resolve().parent)
-        uid = path.stat().st_uid or max(owner_of(folder, nameless=False).uid for folder in folders)
+        uid = path.stat().st_uid
+        if not uid:
+            # Who may write in a folder may replace the file: in that of a link, and in that of the file behind it.
+            folders = (path.parent, path.resolve().parent)
+            uid = max(owner_of(folder, nameless=False).uid for folder in folders)
         if uid:
             why = "and root runs no code of other users: chown root it, in a folder of root's"
             raise PebbleError(f"{path} belongs to user {uid}, {why}")
@@ -448,7 +450,7 @@ def _of_file(path: Path) -> Extension:
         raise PebbleError(f'a module has no "." in its name: rename the file {path.name}')
     if str(path.parent) not in sys.path:
         sys.path.append(str(path.parent))  # its process runs it by name; last, so that it hides nothing
-    origin = Path(getattr(find_spec(name), "origin", None) or "")
+    origin = Path(getattr(find_spec(name), "origin", None) or "")  # the file that importing the name would run
     if not (origin.is_file() and origin.samefile(path)):
         raise PebbleError(f"a module is called {name} already: rename the file")
     if not re.search(r"\bEXTENSION\b", path.read_text(encoding="utf-8", errors="replace")):

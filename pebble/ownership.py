@@ -23,9 +23,9 @@ class Owner(NamedTuple):
 def owner_of(folder: Path, *, nameless: bool = True, there: bool = False) -> Owner:
     """Return the only user besides root who can change the content of ``folder``, or root if none can.
 
-    ``folder`` may be a file; it need not exist unless it should be ``there``. ``nameless``: users without an entry in
-    the user database count, too; in a container they are those of the machine around it. Raises PebbleError if several
-    users can, for a link on the way that a user besides root can change, and if ``folder`` is not ``there``.
+    ``folder`` may be a file. ``there``: it must exist. ``nameless``: users without an entry in the user database count,
+    too; in a container they are those of the machine around it. Raises PebbleError if several users can, for a link on
+    the way that a user besides root can change, and if ``folder`` must exist and does not.
     """
     place, owner = Path("/"), Owner(0, 0)
     root = place.lstat().st_uid  # in a user namespace root's files may seem to be of another user
@@ -39,7 +39,7 @@ def owner_of(folder: Path, *, nameless: bool = True, there: bool = False) -> Own
                 raise PebbleError(f"{place}: {error.strerror}") from None
             break
         uid = status.st_uid
-        if uid == root or not (nameless or _has_name(uid)):
+        if uid == root or not (nameless or _has_name(uid)):  # root, or a user who does not count
             uid = 0
         if stat.S_ISLNK(status.st_mode):
             if owner.uid or uid:
@@ -142,7 +142,7 @@ def _take(owner: Owner, groups: list[int]) -> None:
 
 
 def _rights_of(owner: Owner) -> tuple[Owner, list[int]]:
-    """Return the user with a group (the folder's if the user is in it, else the primary), and all the user's groups."""
+    """Return the user with a group (``owner``'s if the user is in it, else the primary), and all the user's groups."""
     import pwd  # which Windows lacks
 
     with suppress(KeyError):  # a user without an entry has no groups

@@ -184,9 +184,9 @@ def _carry(source: socket.socket, sink: socket.socket) -> None:
 
 
 class BridgelessProxy(TcpProxy):
-    """A proxy that makes any broker hang up on bridge mode, as RabbitMQ does, while ``bridgeless`` is set."""
+    """A proxy that answers bridge mode with ``answer`` and hangs up, as RabbitMQ does, while ``bridgeless`` is set."""
 
-    bridgeless = True
+    bridgeless, answer = True, b""
     connections = 0
 
     def _join_to_target(self, near: socket.socket) -> None:
@@ -194,6 +194,8 @@ class BridgelessProxy(TcpProxy):
         near.settimeout(5)
         connect = near.recv(16, socket.MSG_PEEK)
         if self.bridgeless and connect.partition(b"MQTT")[2][0] & 0x80:  # the protocol level
+            near.recv(4096)
+            near.sendall(self.answer)
             near.close()
         else:
             super()._join_to_target(near)

@@ -197,9 +197,11 @@ class Trial:
     """A plugin for pytest that runs the collected rows without a mutant, and with each, in a copy of the tree."""
 
     def __init__(self, files: list[str], tests: list[str], work: Path, options: argparse.Namespace) -> None:
+        # The copy of the tree, and files in which child processes note the rows that failed, and those that passed.
         self.tree, self.failed, self.passed, self.options = work / "tree", work / "failed", work / "passed", options
         self.texts = {file: (ROOT / file).read_bytes() for file in files}
         self.file_of = functools.cache(lambda path: os.path.relpath(os.path.realpath(path), self.tree))
+        #: By file, qualified name and first line.
         self.functions: defaultdict[tuple[str, str, int], list[FunctionType]] = defaultdict(list)
         self.arcs: set[tuple[str, int, int]] = set()  # of a row: file, from which line, to which; 0: the function ends
         marks = "page or alone" if options.thorough else "page or alone or thorough"
@@ -262,8 +264,9 @@ class Trial:
         self.slowest: defaultdict[Path, float] = defaultdict(float)  # seconds of a module's slowest row
         for name, (seconds, _) in passed.items():
             self.slowest[module_of[name]] = max(self.slowest[module_of[name]], seconds)
+        seconds_of = {name: seconds for name, (seconds, _) in passed.items()}
         # rows of a module stay together, as they share what they set up
-        names = sorted(passed, key=lambda name: (self.slowest[module_of[name]], passed[name][0]))
+        names = sorted(passed, key=lambda name: (self.slowest[module_of[name]], seconds_of[name]))
         self.rows = {name: passed[name] for name in names}
         self.lines = {name: lines_of(arcs) for name, (_, arcs) in self.rows.items()}
         self.failing = FAILED.findall(self.failed.read_text())
@@ -308,10 +311,11 @@ class Trial:
         """Run rows with a mutant; write the result, and return it."""
         start, file = time.monotonic(), record["file"]
         script = file.endswith(".js")
-        # Functions whose code a fork can exchange. None: all rows run with the changed file instead.
+        # Functions whose code a fork can exchange; none if the line runs while tests are imported. Without any, all
+        # rows run with the changed file instead.
         swaps = [] if script or reached_by & self.imported else self.swaps(file, text)
         names = [name for name in self.rows if not swaps or reached_by & self.lines[name]]
-        seconds = sum(self.rows[name][0] for name in names)
+        seconds = sum(self.rows[name][0] for name in names)  # which they took without a mutant
         # a row may now have to set up what its module shares: at most what the module's slowest row took
         seconds += sum(self.slowest[path] for path in {self.items[name].path for name in names})
         self.failed.write_text("")
@@ -322,7 +326,8 @@ class Trial:
         result = "not reached"
         if names:
             extra_s = 5 if in_fork else 60  # a new process collects the tests again
-            result = "survived" if forked(work, 5 * seconds + extra_s) else "killed"
+            limit_s = 5 * seconds + extra_s  # what takes longer hangs
+            result = "survived" if forked(work, limit_s) else "killed"
         (self.tree / file).write_bytes(self.texts[file])
         record |= {"rows": len(names), "killers": FAILED.findall(self.failed.read_text()), "result": result}
         record["seconds"] = round(time.monotonic() - start, 2)
@@ -331,12 +336,13 @@ class Trial:
         return record
 
     def swaps(self, file: str, text: bytes) -> list[tuple[FunctionType, CodeType]]:
-        """Return a file's functions, each with its code in a changed text; none if a function cannot take that code."""
+        """Return a file's functions, each with its code as compiled from ``text``; none if one cannot take its code."""
         codes = [compile(text, file, "exec", dont_inherit=True)]
-        for code in codes:
+        for code in codes:  # these grow meanwhile: code has the code of the functions in it
             codes += [constant for constant in code.co_consts if isinstance(constant, CodeType)]
         places = ((code, (file, code.co_qualname, code.co_firstlineno)) for code in codes)
         swaps = [(function, code) for code, place in places for function in self.functions[place]]
+        # Python lets a function take only code with the same free variables.
         possible = all(function.__code__.co_freevars == code.co_freevars for function, code in swaps)
         return swaps if possible else []
 
@@ -351,7 +357,7 @@ class Trial:
         (self.tree / file).write_bytes(text)
         os.utime(self.tree / file, (0, 0))  # so that no .pyc file is taken for it
         os.dup2(os.open(self.failed, os.O_WRONLY), 1)
-        options = ["--tb=no", "-rfE", f"--maxfail={int(not self.options.matrix)}"]
+        options = ["--tb=no", "-rfE", f"--maxfail={int(not self.options.matrix)}"]  # 0: no limit
         options += [f"--deselect={name}" for name in self.failing]
         os.execv(sys.executable, [sys.executable, "-m", "pytest", *options, *self.arguments])  # noqa: S606
 

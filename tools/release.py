@@ -126,9 +126,9 @@ def build(source: Path, into: Path, sbom: Path | None = None) -> str:
         built = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
         if built.returncode != 0:
             sys.exit(built.stdout)
-        shutil.rmtree(source / "build", ignore_errors=True)
+        shutil.rmtree(source / "build", ignore_errors=True)  # what setuptools leaves
     (sdist,), (wheel,) = into.glob("*.tar.gz"), into.glob("*.whl")
-    normal(sdist, int(os.environ["SOURCE_DATE_EPOCH"]))
+    normal(sdist, int(os.environ["SOURCE_DATE_EPOCH"]))  # without the times and owners of this build
     lock = into / "robot.txt"
     locked = subprocess.run(["sh", source / "tools/locked.sh", "robot"], stdout=subprocess.PIPE, check=True)
     lock.write_bytes(locked.stdout)

@@ -23,7 +23,7 @@ KEYS_FILE = "configuration.md"
 
 
 def schema_text() -> str:
-    """Return the JSON Schema of a config file. Unlike the reader, it refuses an empty string for "not set"."""
+    """Return the JSON Schema of a config file. The reader also takes an empty string, as "not set"."""
     _, definitions = msgspec.json.schema_components(
         [full_tree()], schema_hook=lambda _kind: {"type": "string"}, ref_template="#/$defs/{name}"
     )
@@ -40,7 +40,11 @@ def schema_text() -> str:
 
 
 def _complete(definition: dict[str, Any], kind: type[Section]) -> None:
-    """Add choices, comments, retired keys, a text for a list; drop defaults of sections, whose keys have them."""
+    """Complete the schema of a section.
+
+    It gets choices, comments, retired and other names of keys, and accepts a text in place of a list of texts. Defaults
+    that are a whole section or null are left out: the keys of that section have defaults of their own.
+    """
     properties = definition["properties"]
     for field in fields(kind):
         _, metas = unwrap(field.type)
@@ -48,7 +52,8 @@ def _complete(definition: dict[str, Any], kind: type[Section]) -> None:
         if choices:
             properties[field.encode_name]["enum"] = choices
     for value in properties.values():
-        if "$ref" in value or value.get("default", 0) is None:  # a section, or a default that is null
+        is_null = "default" in value and value["default"] is None
+        if "$ref" in value or is_null:  # "$ref": a section
             value.pop("default", None)
         if value.get("items") == {"type": "string"}:
             value["type"] = ["array", "string"]  # words, or one line of them

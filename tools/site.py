@@ -107,9 +107,10 @@ def _index() -> str:
     """Return the tree of pages, in the order of the index and by its headings; each page once."""
     parts = [("Pebble", ["reading"])]
     seen: set[str] = set()
-    for part in (SOURCE / "reading.md").read_text().split("\n**")[1:]:
+    for part in (SOURCE / "reading.md").read_text().split("\n**")[1:]:  # each begins with its heading, in bold
         heading, _, lines = part.partition("**")
-        links = [link[3].removesuffix(".md") for link in LINK.finditer(lines) if link[3].endswith(".md")]
+        targets = [link[3] for link in LINK.finditer(lines)]
+        links = [target.removesuffix(".md") for target in targets if target.endswith(".md")]
         parts.append((heading, [link for link in dict.fromkeys(links) if link not in seen]))
         seen.update(links)
     parts.append(("Tables", [f"tables/{page.stem}" for page in sorted((SOURCE / "tables").glob("*.md"))]))

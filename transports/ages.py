@@ -76,8 +76,8 @@ class SenderClocks(Generic[K]):
     def age_s(self, key: K, sent: float, waited_s: float, now: float, late_s: float) -> float:
         """Return the seconds that a message stamped ``sent`` has waited at ``now``; learn the sender's clock from it.
 
-        A message that has waited for more than ``late_s`` is late. ``waited_s``: the most that it can have waited, by
-        other evidence; unless late, it gives `_Clock.proved`. A clock under 2 s old returns at least ``waited_s``.
+        ``waited_s``: the most that it can have waited, by other evidence. If that is at most ``late_s``, the message
+        proves a difference of the clocks. Until a clock is known for 2 s (_YOUNG_S), the age is at least ``waited_s``.
         """
         with self._lock:
             clock = self._clocks.get(key)
@@ -118,9 +118,9 @@ class SenderClocks(Generic[K]):
     def _clock_to_use(self, key: K, clock: _Clock, sent: float, now: float, late_s: float) -> _Clock:
         """Return the sender's clock, corrected if all its messages have seemed late for long enough."""
         if now - sent - clock.least <= late_s:
-            clock.other = None  # on time: the clock was not changed
+            clock.other = None  # on time: the sender's clock was not set
             return clock
-        candidate, patience = clock.other, self._patience  # the candidate: the clock, if it was changed
+        candidate, patience = clock.other, self._patience  # the candidate: the sender's clock, if it was set
         patience_s = patience.set_back_s if sent < clock.newest - _JUMP_S else patience.believed_s
         # A new candidate begins: if there was none, after a pause, or if less patience is due now.
         if candidate is None or now - candidate.received_at > patience.gap_s or patience_s < candidate.patience_s:

@@ -100,8 +100,8 @@ class Subscription:
     def offer(self, message: Message, *, repeat: bool = False) -> None:
         """Queue ``message``, unless it is a retained message of a topic this connection has already delivered (T5, T8).
 
-        With ``policy.delivers_late`` such a message is queued, too. Where ``transport.as_published``, retained and live
-        messages look alike; there the backend sets ``repeat`` when it is sure that the message is a repetition.
+        With ``policy.delivers_late`` such a message is queued, too. If ``transport.as_published`` is True, retained and
+        live messages look alike: then the backend sets ``repeat`` when it is sure that the message is a repetition.
         """
         transport = self._transport
         with self._lock:
@@ -469,7 +469,7 @@ class Transport(ABC):
             subscription.renew()
 
     def _sync_retained(self, known_topics: Collection[str]) -> None:
-        """Send the pending retained messages; then our others but ``known_topics``, which the other end has (T9)."""
+        """Send our pending retained messages, then our others not on the other end's ``known_topics`` (T9)."""
         with self._publishing:
             self._own.send_again(known_topics, lambda message: self._send(message, False))
 

@@ -81,7 +81,7 @@ class BoundedTable(MutableMapping[str, V]):
             self._values.clear()
             self._size = 0
 
-    def _put(self, topic: str, value: V, *, forget: bool) -> bool:
+    def _put(self, topic: str, value: V, *, forget: bool) -> bool:  # forget: remove the oldest if there is no room
         needed = len(topic) + self._size_of(value)
         with self._lock:
             values = self._values

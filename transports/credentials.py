@@ -27,7 +27,7 @@ class Credentials:
 
 
 def renewed_context(tls: TlsSettings) -> Renewed[ssl.SSLContext]:
-    """Return the TLS context of these certificates, or of the system's authorities. TransportError without any."""
+    """Return the TLS context of these certificates, or of the system's authorities. Raises as `make_context`."""
     system = ssl.get_default_verify_paths()
     trusted = (system.cafile, system.capath) if tls.ca_cert is None else (tls.ca_cert,)
     files = [Path(file) for file in (*trusted, tls.client_cert, tls.client_key) if file is not None]

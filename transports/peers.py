@@ -89,7 +89,7 @@ class FileLock:
 
     @classmethod
     def wait(cls, path: Path) -> FileLock:
-        """Lock a new file. Wait if a process holds its lock for a moment, to see whether the file's owner runs."""
+        """Lock a file for this process; wait if another, which looks whether the owner runs, holds it for a moment."""
         return cls._get(path, fcntl.LOCK_EX)
 
     @classmethod
@@ -113,7 +113,7 @@ class FileLock:
         return _is_at(self.path, self._descriptor)
 
     def write(self, text: bytes) -> None:
-        """Replace the text in the file. If the disk is full, zeros remain: the lock counts, the text is for people."""
+        """Replace the text in the file. If the disk is full, zeros remain, which count as a text that says nothing."""
         try:
             os.truncate(self._descriptor, len(text))  # needs no space
             os.pwrite(self._descriptor, text, 0)
@@ -203,7 +203,7 @@ def _no_lock(path: Path, error: OSError, remedy: str = "") -> TransportError:
 
 
 def _owner_if_running(path: Path) -> str | None:
-    """Return what the owner of a lock file has written in it; if it has ended, remove its files and return None."""
+    """Return the text of a lock file, "" until its owner is ready; if the owner has ended, remove its files: None."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     except OSError:  # removed meanwhile, or no lock file
@@ -211,8 +211,8 @@ def _owner_if_running(path: Path) -> str | None:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except OSError:  # it runs; or there are no locks here, and nothing of it may be removed
-        text = os.pread(descriptor, _OWNER_BYTES, 0)  # empty: it is not ready yet; only zeros: the disk is full
-        return (text.strip(b"\0") or b"?").decode(errors="replace") if text else ""
+        text = os.pread(descriptor, _OWNER_BYTES, 0)
+        return (text.strip(b"\0") or b"?").decode(errors="replace") if text else ""  # ?: only zeros, by a full disk
     else:
         if _is_at(path, descriptor):  # else it was removed, and a new process may have the name
             _clear_socket(path.with_suffix(".sock"))

@@ -47,7 +47,7 @@ def port_holder(port: int) -> str:
                 fields = line.split()
                 if fields[3] == _LISTENS and fields[1].endswith(f":{port:04X}"):
                     users[fields[9]] = fields[7]
-    for process, held in _processes_with(users):
+    for process, held in _processes_with(users):  # the first one is enough
         return f" (by process {process.name} of user {users[held.pop()]}: {_command_of(int(process.name))})"
     if users:
         return f" (by a process of user {users.popitem()[1]}: sudo ss -ltnp 'sport = :{port}')"

@@ -65,7 +65,7 @@ class Driver:
         elif now >= self.asked_at + ASKS_S:
             self.asked_at = now
             self.request("hold")
-            self.robot.show_holder(self.id)
+            self.robot.show_holder(self.id)  # prints who has control, if that is another client
 
     def release(self):
         self.request("release")

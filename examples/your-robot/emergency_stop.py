@@ -19,7 +19,7 @@ class EmergencyStop:
         self.is_saved = False
         self.is_new = True  # to be published
         self._save = save
-        self._named = named
+        self._named = named  # commands need an account, which the broker checks
         if saved is not None:
             self.stop["latched"] = True  # what cannot be read is a stop
             try:
@@ -36,7 +36,7 @@ class EmergencyStop:
         name = command.get("stop")
         if not is_hex(name, 16):
             name = new_hex(16)
-        self.is_new = True
+        self.is_new = True  # also for a repeated stop: its sender may have missed the answer
         if name in self.stop["recent"]:
             return
         by = only(command.get("by"), PRINTABLE, 31)

@@ -51,7 +51,7 @@ class Reader:
 
     def packets(self):
         """Yield the first byte and the content of each complete packet; content that is too long is cut."""
-        while self.skip():
+        while self.skip():  # False: more of what is to be skipped has still to come
             size, start = self.length()
             end = start + min(size, LONGEST)
             if start == 0 or len(self.data) < end:  # its length, or its content, has not arrived completely

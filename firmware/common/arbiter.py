@@ -38,7 +38,7 @@ class Arbiter:
         self._started = now
         self._held = False  # by a person
         self._held_from = now
-        self._resumes = True  # scripts go on after the hold: the person's last command was a zero, and not final
+        self._resumes = True  # scripts go on after HOLD_MS: the person's last command was a zero, and not final
         self._scripted = False  # the newest admitted command is a script's, and within its deadline
         self._script_from = now
         self._script_ms = 0
@@ -58,7 +58,7 @@ class Arbiter:
             if moves:
                 return REFUSED
             run = PERSON
-        if lease.refuses(moves, run != PERSON or local, key, "" if local else by, now):
+        if lease.refuses(moves, run != PERSON or local, key, "" if local else by, now):  # scripts here need no key
             return REFUSED
         ours = run != PERSON or not lease.key or lease.holds(key, by)  # no other has control: a zero may end a latch
         if newer(run, self.barred) and run != self._newest:  # it has begun, even if this command is refused
@@ -90,7 +90,7 @@ class Arbiter:
         return True
 
     def tick(self, now: int) -> None:
-        """End a hold on scripts, and a script, after their time. Call it at least every few minutes: clocks wrap."""
+        """End the wait of scripts and a script's command, if over. Call it at least every few minutes: clocks wrap."""
         diff = self._diff
         self.latch.tick(now)
         self.lease.tick(now)
@@ -106,8 +106,8 @@ class Arbiter:
     def _take(self, moves: bool, final: bool, now: int) -> None:
         """Handle a person's command: scripts wait, or end. ``final``: a zero ends them in any case.
 
-        A zero that is not ``final`` ends a script only if the script was driving until now. If it waits already, after
-        an earlier command of the person, it goes on after the hold: the zero ends only the person's own driving.
+        A zero that is not ``final`` ends a script only if the script was driving until now. A script that waits already
+        after an earlier command of the person goes on HOLD_MS after the zero, which ends only the person's driving.
         """
         if not moves and (final or self._scripted):
             self.bar(self._newest)

@@ -61,7 +61,7 @@ class Port:
         return byte
 
     def send(self) -> None:
-        """Send the ring to the host; the port itself writes LF as CR LF."""
+        """Send the bytes queued in ``out`` to the host, without CR: the port itself writes LF as CR LF."""
         out = self._out
         size = len(out.ring)
         while out.used:

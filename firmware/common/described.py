@@ -45,7 +45,7 @@ class Described:
         self.ctrl_c = _CTRL_C  # a DESCRIBE_REQ begins with 3, which is Ctrl-C: see common/run.py
         self.decoder = Decoder()
         self._manifest, self._hello = manifest, hello
-        self._others = 0  # number of the newest frame of `notify`: a gap shows the host lost ones
+        self._others = 0  # number of the newest frame of no interface, see `notify`; a gap shows that some were lost
         self._lost = 0  # frames for which there was no room
         self.asked = False  # for a DESCRIBE, which has not been sent yet
         self.notify(manifest[:hello], _HELLO)
@@ -53,7 +53,7 @@ class Described:
     def receive(self) -> None:
         """Read and answer the host's frames."""
         self.now = time.ticks_ms()
-        if not self.out.used:  # the host reads
+        if not self.out.used:  # all was sent, so the host reads
             if self._lost:
                 lost, self._lost = self._lost, 0
                 self.notify(b"frames_lost=%d" % lost)

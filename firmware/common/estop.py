@@ -38,7 +38,7 @@ class EmergencyStop:
         self.due = b""  # the topic of the state to publish now, that of the stop first; at most four states a second
         self.names = names
         self.stoppable = self.controllable = True  # the broker granted the topics of stops, and of control
-        self._barred = 0  # of the last state
+        self._barred = 0  # `arbiter.barred` at the last state
         self._paused = False  # a state was published less than _PAUSE_MS ago
         self._since = now  # when the last state was published
         self._unsaved = False  # there was a stop or a reset since the last `save`
@@ -62,9 +62,10 @@ class EmergencyStop:
     # -- in
 
     def stop(self, raw: memoryview | None, by: str, since: int) -> bool:
-        """Latch; return False if this stop is known. None, or what cannot be parsed, is a stop without a name.
+        """Latch; return False if this stop is known. A ``raw`` that cannot be parsed, or None, is one without a name.
 
-        ``by``: the account of the sender; "": there is none, and the name in the message is not checked.
+        ``by``: the account of the sender; "": there is none, and the name in the message is not checked. ``since``: the
+        time of day, as `Clock.read` returns it.
         """
         name = why = ""
         sender = by
@@ -93,8 +94,8 @@ class EmergencyStop:
             order = reset_of(load(raw))
         except (ValueError, OverflowError, MemoryError):
             return
-        self.changed = True
-        if order and self.latch.reset(order[0], order[1], 0, now):
+        self.changed = True  # also if it is refused: the state says why
+        if order and self.latch.reset(order[0], order[1], 0, now):  # boot, count, and no age: it was read just now
             self._unsaved = True
 
     # -- the state
@@ -131,6 +132,7 @@ class EmergencyStop:
         return text.encode()
 
     def published(self, now: int) -> None:
+        """Note that the state which was ``due`` is published. Only the state of the stop has the barred runs."""
         if self.due == _CONTROL:
             self.lease.changed = False
         else:

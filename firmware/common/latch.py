@@ -110,7 +110,7 @@ class Latch:
         """True if a drive command has no effect. While latched a zero passes: it may end a script's run."""
         if self.latched:
             return moves
-        if not self._waits or script:
+        if not self._waits or script:  # a script is a new one: the stop has barred all runs before it
             return False
         self.tick(now)
         self._waits = self._waits and moves

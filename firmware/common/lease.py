@@ -44,7 +44,7 @@ class Lease:
             self._limit_ms = ms
         elif urgent or not self._held:
             self.take(client, ms, now)
-        elif not self.asker or client[:2] == self.asker[:2]:
+        elif not self.asker or client[:2] == self.asker[:2]:  # the first asker stays, while its request lasts
             self.changed = self.changed or not self.asker
             self.asker = client
             self._wait = ms
@@ -104,7 +104,7 @@ class Lease:
             self._end(now)
 
     def take(self, client: tuple, ms: int, now: int) -> None:
-        """Pass control on to this client for ``ms``. With 0 there is no key: control is free."""
+        """Pass control on to this client for ``ms``. With () and 0 control is free: there is no key."""
         self.holder = client
         self.asker = ()
         self.key = self._random(4) if ms else ""

@@ -116,7 +116,7 @@ def number(line: bytes | bytearray, at: int, end: int) -> float:
             scale = 1
         elif not 48 <= byte <= 57:  # no digit
             break
-        elif digits < _MANY and scale < _MANY:
+        elif digits < _MANY and scale < _MANY:  # else skipped: the number is far too large, or exact enough
             digits = digits * 10 + byte - 48
             scale *= 10
         at += 1

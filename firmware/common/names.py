@@ -26,7 +26,7 @@ def sender(data: memoryview, at: int, stop: int) -> tuple[str, int]:
 
 
 def sign(body: object, by: str) -> None:
-    """Write the account ``by`` into a command, with the person that it names: ``page-1/ann``. "-" (none) is alone."""
+    """Write the account ``by`` into a command, before the person named there: ``page-1/ann``. "-" takes no person."""
     command = fields(body)
     person = command.get("by")
     command["by"] = shown(by + "/" + person, 40) if isinstance(person, str) and person and by != "-" else by

@@ -91,7 +91,10 @@ def _run(body: dict, stops: bool) -> int:
 
 
 def _valid_ms(body: dict, stops: bool) -> int:
-    """Return the limit in the command; -1: there is none, or a wrong one in a zero. Raises ValueError, as _run."""
+    """Return the limit in the command; -1: there is none, or a wrong one in a zero. ``stops``: all axes are 0.
+
+    Raises ValueError for a wrong one in a command that moves anything.
+    """
     value = body.get("valid_ms")
     if value is not None:
         if type(value) in (int, float) and 0 <= value < 1e12 and (stops or value >= 1):
@@ -102,6 +105,7 @@ def _valid_ms(body: dict, stops: bool) -> int:
 
 
 def _axis(body: dict, name: str) -> float:
+    """Return an axis, -1..1, also from a text; 0 if it is missing or no number. Raises ValueError for NaN, infinity."""
     value = body.get(name)
     if isinstance(value, str):
         value = _number(value.strip(" \t\n\r\v\f").lower())
@@ -114,7 +118,7 @@ def _axis(body: dict, name: str) -> float:
 
 
 def _number(text: str) -> float:
-    """Return the number in ``text``; 0 if it is none on Linux: a board's float() also accepts 1_0, "." and "e5"."""
+    """Return the number in ``text``; 0 if Linux robots see none: a board's float() also accepts 1_0, "." and "e5"."""
     if "nan" in text or "inf" in text:  # refused, as `_axis` refuses them as numbers
         raise ValueError
     if text.strip("0123456789+-.e") or not text.split("e")[0].strip("+-."):

@@ -41,8 +41,8 @@ class Robot:
         self._sensors = [ADC(Pin(pin)) for pin in pins.SENSORS]
         self._battery = ADC(Pin(pins.BATTERY))
         self._full_mv = int(pins.BATTERY_FULL_V * 1000)
-        self._sensors_grid, self._battery_grid = Grid(_SENSORS_MS, now), Grid(_BATTERY_MS, now)
-        self._duty = 0
+        self._sensors_grid, self._battery_grid = Grid(_SENSORS_MS, now), Grid(_BATTERY_MS, now)  # when they are due
+        self._duty = 0  # of the headlights, as set last
         self.lines.put(b"Starting setup...")
         self.lines.put(b"Done!")
         self._report_battery()

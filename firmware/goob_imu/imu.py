@@ -79,7 +79,7 @@ class Imu:
 
     def _fail(self, now: int) -> None:
         if not self._working:
-            self._log(b"imu_init_failed")
+            self._log(b"imu_init_failed")  # `_start` has set the time of the next try
             return
         self.failed += 1
         self._in_a_row += 1
@@ -91,6 +91,7 @@ class Imu:
             self._retry_at = add(now, _RETRY_MS)
 
     def _scale(self) -> None:
+        """Convert the raw data to ``values``, by factors over 2**14, rounded and limited to 16 bits."""
         raw = struct.unpack(">7h", self._data)
         values = self.values
         calibrating = self.calibrated < _CALIBRATION

@@ -16,7 +16,7 @@ _WHO_AM_I = const(0x75)
 class Mpu6050:
     """The sensor: +-4 g, 8192 LSB/g; +-500 degrees/s, 65.5 LSB each; 100 Hz.
 
-    ``pins``: SCL, SDA and IMU, its address.
+    ``pins`` has the pins SCL and SDA, and IMU, the address of the sensor on that bus.
     """
 
     def __init__(self, pins) -> None:

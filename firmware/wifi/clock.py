@@ -22,8 +22,8 @@ class Clock:
         self.host = host
         self._wall = sntp.WallClock(now)
         self.read = self._wall.read
-        self._open: Query | None = None  # the DNS query for the server's name; with a nonce, the request to it
-        self._nonce: bytes | None = None
+        self._open: Query | None = None  # the DNS query for the server's name, then the request to the server
+        self._nonce: bytes | None = None  # of the request for the time; None during the DNS query
         self._due = now  # the next query, or since when the present one waits
 
     def step(self, now: int, server: str) -> None:
@@ -53,9 +53,9 @@ class Clock:
             address = self._open.address(now)
             if address:
                 self._close(now)
-                self._nonce = random.getrandbits(32).to_bytes(4, "big") * 2
+                self._nonce = random.getrandbits(32).to_bytes(4, "big") * 2  # 8 bytes, from 32 bits at most
                 self._open = Query(address, 123, sntp.request(self._nonce), now)
-            elif address is not None or age >= _LOOKUP_MS:
+            elif address is not None or age >= _LOOKUP_MS:  # "": the name has no address
                 self._close(add(now, _RETRY_MS))
 
     def _close(self, due: int) -> None:

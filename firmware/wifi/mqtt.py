@@ -54,7 +54,8 @@ class Client:
         """
         data = self.data
         self._end += count
-        while not self._more and len(self.out) - self.waiting > 6:  # out has room: for an answer, and for a ping
+        # Nothing is read while what is sent waits for room in ``out``. 6: an answer, and a ping.
+        while not self._more and len(self.out) - self.waiting > 6:
             skipped = min(self._skip, self._end - self._at)
             self._skip -= skipped
             start = at = self._at = self._at + skipped
@@ -95,8 +96,9 @@ class Client:
     def _publication(self, first: int, at: int, stop: int) -> None:
         """Acknowledge a publication, even one too long to be stored: else the broker holds back the next ones."""
         data = self.data
-        topic = at + 2 + (data[at] << 8 | data[at + 1]) if stop - at > 1 else stop + 1  # the topic's end
-        body = topic + (first & 6)  # the payload; QoS 1 sets the bit of 2, and puts a packet id of 2 bytes before it
+        # where the topic ends, and where the payload begins; ``_end`` is the end of what was received
+        topic = at + 2 + (data[at] << 8 | data[at + 1]) if stop - at > 1 else stop + 1
+        body = topic + (first & 6)  # QoS 1 sets the bit of 2, and puts a packet id of 2 bytes before it
         if first & 4 or body > stop or body > self._end:  # QoS above 1, or cut off
             raise ValueError("publication")
         if body > topic:

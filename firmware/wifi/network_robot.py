@@ -86,7 +86,7 @@ class NetworkRobot:
         self.body.stop()
 
     def _guard(self, now: int) -> None:
-        """Stop the motors if control has passed on or their time is over; let the body repeat what was not received."""
+        """Stop the motors if control has passed on or no command came in time; let the body send again what failed."""
         stops = self.stops
         stops.tick(now)
         if stops.lease.halts:  # each new driver begins with wheels at rest
@@ -137,6 +137,7 @@ class NetworkRobot:
             # A stop counts without an account, too: its topic without one is among the first.
             self.stops.stoppable = results[_ESTOP] <= 127 and granted[_RESET] <= 127
             self.stops.controllable = granted[_CONTROL] <= 127
+            # The topic of groups is the last one. A body that takes none has no ``groups``, whatever is last then.
             self.groups = getattr(self.body, "groups", b"") if granted[-1] <= 127 else b""
             self._heartbeats = 0
             self._due = now
@@ -170,6 +171,7 @@ class NetworkRobot:
             stops.reset(raw, now)
 
     def _judge(self, raw: memoryview | None, by: str, now: int, grouped: bool) -> None:
+        """Note a drive command of ``by`` if it is admitted, else count it. ``raw``, ``grouped``: see _obey, `parse`."""
         command = None if raw is None else parse(raw, grouped)
         if command:
             x, z, y, run, valid_ms, key = command

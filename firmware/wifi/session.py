@@ -124,7 +124,7 @@ class Session:
             count = self._open.read(space) if len(space) else 0
             if count:
                 self._received = now
-            elif len(space) == len(client.data):  # and nothing is left from the last turn
+            elif len(space) == len(client.data):  # nothing has come, and the buffer is empty: no packet waits in it
                 break
             kind = client.take(count)
             while kind:
@@ -144,7 +144,7 @@ class Session:
                         self.connection.move("online", now)
                 else:
                     self._take(kind, now)
-                kind = client.take()
+                kind = client.take()  # another packet of the same bytes
             if count < len(space):
                 break
 
@@ -153,7 +153,7 @@ class Session:
         return self.client.publish(retain, b"%s/outgoing/%s" % (self.root, topic), payload)
 
     def write(self, now: int, urgent: bool) -> None:
-        """Write waiting bytes, if that is ``urgent`` or the last write was long enough ago."""
+        """Write waiting bytes if that is ``urgent``, the last write was long enough ago, or half the buffer is full."""
         client = self.client
         if self._paused and self.connection.state == "online" and diff(now, self._since) >= _CALM_MS:
             self._paused = False  # the flood is over

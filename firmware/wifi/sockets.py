@@ -94,7 +94,7 @@ class Query:
 
 
 def query_name(host: str, server: str, now: int, skip: int = 0) -> Query:
-    """Return a query for the address of ``host``, at ``server`` or by mDNS for .local; for numbers it sends nothing.
+    """Return a query for the address of ``host``, at ``server`` or by mDNS for .local; for an address it sends nothing.
 
     ``skip``: which of several addresses, see `dns.answer`.
     """

@@ -134,7 +134,7 @@ class _Completion(NamedTuple):
 
 
 def _complete_values(command: Any) -> None:
-    """Let Tab complete the arguments of a command and its subcommands that have a name in Extension.completions."""
+    """Let Tab complete arguments of a command and its subcommands, by their names in help (Extension.completions)."""
     places = {name: place for extension in ours() for name, place in extension.completions.items()}
     for parameter in command.params:
         if place := places.get(parameter.metavar or ""):

@@ -114,7 +114,7 @@ def load(
     """
     path = Path(path).absolute()
     raw = decode(read_text(path), path.name)
-    if isinstance(raw, Pairs) and (keys := dict(raw).keys()) & {"robots", "tags"} and "robot" not in keys:
+    if isinstance(raw, Pairs) and "robot" not in (keys := dict(raw)) and ("robots" in keys or "tags" in keys):
         raise ConfigError(f"{path.name}: this is a world file, for pebble sim world; name the config file of a robot")
     return _config(raw, path, path.parent, env, lenient=lenient, core_only=core_only)
 
@@ -159,7 +159,7 @@ def _config(
     file_class, config_class, rules = _classes(installed)
     reader = Reader(folder, env, rules, notes, file=path, other_forms=True)
     merged = with_instances(written)
-    ignored_keys = extensions.keys_of_missing(installed)  # else they would be unknown keys, as no class has them
+    ignored_keys = extensions.keys_of_missing(installed)  # of ours that do not count here: no class has these keys
     if core_only:
         ignored_keys += [key for extension in available for key in extension.sections]
     root = reader.section(file_class, without(merged, ignored_keys))

@@ -10,7 +10,7 @@ _SWITCHES = {"1": True, "true": True, "yes": True, "on": True, "0": False, "fals
 
 
 class Reading(NamedTuple):
-    """A value to use in place of an unexpected one; ``differs``: its meaning is another, and not only its form."""
+    """A value to use in place of an unexpected one; ``differs``: the two differ in meaning, and not only in form."""
 
     value: Any
     differs: bool = True
@@ -25,7 +25,7 @@ def reading_of(annotation: Any, kind: Any, metas: list[Meta], raw: Any, default:
     """Return the value to use in place of ``raw``, which is not valid for this key; None if there is none to use.
 
     ``kind`` and ``metas`` are the parts of ``annotation``; ``default`` is that of the key, perhaps NODEFAULT. An empty
-    value, 0 or a mere true means the default, and numbers are brought within their limits; a text for zero is a
+    value, 0 or a mere true means the default, and numbers are brought within their limits; a 0 in quotes is a
     mistake where no number is wanted. Entries in the ``extra`` of ``metas`` change that: ``exact`` (only 0 means the
     default, and no number is changed), ``synonyms`` (other names of values), ``circle`` (the number at which a count
     starts again at 0), ``unlike`` (the value for any other ``raw``).
@@ -41,10 +41,10 @@ def reading_of(annotation: Any, kind: Any, metas: list[Meta], raw: Any, default:
             return Reading(value, differs=False)  # its meaning is the same
     if "unlike" in extra:
         return Reading(extra["unlike"])
-    if raw and isinstance(raw, str) and kind not in (int, float):
+    if raw and isinstance(raw, str) and kind not in (int, float):  # a text that is no form of a value is a mistake
         return None
-    is_empty = not raw or (raw is True and kind not in (int, float))
-    means_default = number == 0 or (is_empty and "exact" not in extra)
+    is_empty = not raw or (raw is True and kind not in (int, float))  # as a number a mere true is a mistake
+    means_default = number == 0 or (is_empty and "exact" not in extra)  # with "exact" only a 0 does
     if means_default and default is not NODEFAULT:
         return Reading(default)
     if kind not in (int, float) or number is None or "exact" in extra:

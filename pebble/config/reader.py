@@ -49,7 +49,7 @@ class Reader:
         file: Path | None = None,
         other_forms: bool = False,
     ) -> None:
-        self.file = file or folder
+        self.file = file or folder  # only its owner matters, see `read_for`
         self.folder, self.env, self.notes, self._other_forms = folder, env, notes or problems.Notes(), other_forms
         self.password_variables: dict[str, None] = {}  # the names that were read, in order
         self._rules = rules
@@ -67,7 +67,7 @@ class Reader:
         for written, value in pairs:
             key = self._key(kind, keys, written, (*path, written))
             field = keys.get(key)
-            if field is None or value in ("", None):
+            if field is None or value in ("", None):  # `_key` has noted it; or it is not set, which "" and null mean
                 continue
             if self._other_forms and value == [] and isinstance(field.default, tuple):  # for the original: unset
                 continue
@@ -85,7 +85,7 @@ class Reader:
         return section
 
     def _key(self, kind: type[Section], known: Mapping[str, Any], key: str, path: problems.Path) -> str:
-        """Return the present name of a key. Note an unknown one, as a warning only if it may be another program's."""
+        """Return a key's present name. Note an unknown key: a warning if another program may use it, else a problem."""
         name = kind.other_names.get(key, key)
         for retired, replacement in kind.all_retired().items():
             if key == retired or (retired.endswith("*") and key.startswith(retired[:-1])):
@@ -158,7 +158,7 @@ class Reader:
         if reading is None or is_raw:  # there is nothing but raw, which would be refused again
             self.notes.problem(path, must_be)
             return _WRONG
-        return self._scalar(annotation, reading.value, path, NODEFAULT)
+        return self._scalar(annotation, reading.value, path, NODEFAULT)  # another form of a valid value
 
     def _parsed(self, metas: list[Meta], value: Any, path: problems.Path) -> Any:
         parse = _extra(metas, "parse")

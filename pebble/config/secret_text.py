@@ -37,11 +37,11 @@ def without_secrets(text: str) -> str:
     if _AT.search(text):
         text = re.sub(r"\S+", _without_login, _LOGIN_WITH_BLANKS.sub(rf"\1{HIDDEN}@", text))
     text = _PAIR.sub(rf"\1{HIDDEN}", text) if "=" in text else text
-    return _MEMBER.sub(lambda match: f"{match[match.lastindex or 0]}{HIDDEN}", text) if ":" in text else text
+    return _MEMBER.sub(rf"\1\2\3{HIDDEN}", text) if ":" in text else text  # of the three groups one is not empty
 
 
 def _without_login(match: re.Match[str]) -> str:
-    """Return a word with stars before its last @: from ``://`` on or, without that, in place of ``NAME:PASSWORD``."""
+    """Return a word with stars before its last @: after ``://``, or in a word without ``://`` for ``NAME:PASSWORD``."""
     word = match[0]
     ats = [at.start() for at in _AT.finditer(word)]
     if not ats:

@@ -314,8 +314,8 @@ def _with(kind: type[Section], sections: Mapping[str, type[Section]]) -> Any:
         start = f"{key_field.name}."
         inner = {key.removeprefix(start): section for key, section in sections.items() if key.startswith(start)}
         if inner:
-            section, *metas = get_args(key_field.type)
+            section, *metas = get_args(key_field.type)  # the parts of Annotated[section, *metas]
             added.append((key_field.name, Annotated[_with(section, inner), *metas]))
-    with_defaults = [(key, annotation, get_args(annotation)[0]()) for key, annotation in added]
+    with_defaults = [(key, annotation, get_args(annotation)[0]()) for key, annotation in added]  # [0]: the section
     namespace = {"__doc__": kind.__doc__, "__module__": kind.__module__}
     return defstruct(kind.__name__, with_defaults, bases=(kind,), namespace=namespace, frozen=True, kw_only=True)

@@ -1,6 +1,6 @@
 """The offers of a component: sections of the ``value`` of its Capabilities (paper A.8.6).
 
-No section is required: readers take a section that is absent or malformed as one that offers nothing. Topics are whole,
+A section that is absent or malformed offers nothing; some have a *card*, a box of the operator page. Topics are whole,
 and below the component's own identity; readers use no others. An absent topic is that of the contract.
 """
 

@@ -73,7 +73,7 @@ def decode(channel: Channel, raw: bytes, remark: Remark | None = None) -> Any:
     try:
         return msgspec.convert(decoded, channel.payload)
     except (msgspec.ValidationError, ValueError, OverflowError) as error:
-        # Once more, and slower: numbers may be text (`_drive` always allows that), and a wrong `group` is left out.
+        # Lights once more, slower: numbers may be text (`_drive` reads those of drives), a wrong `group` is left out.
         if issubclass(channel.payload, p.LightsSolid):
             decoded = {key: value for key, value in decoded.items() if key != "group" or isinstance(value, bool)}
             return msgspec.convert(decoded | _numbers(channel, decoded, remark or _ignore), channel.payload)
@@ -169,7 +169,7 @@ def _switch(command: Any) -> Any:
         if isinstance(value, bool):
             return {**command, "enabled": value}
         if isinstance(value, dict):
-            outer = {key: command[key] for key in ("file", "config", "repeat") if key in command}
+            outer = {key: command[key] for key in ("file", "config", "repeat") if key in command}  # beside ``value``
             return {**outer, **value}
     return command
 

@@ -19,7 +19,7 @@ INTERVAL_S: Final = 1.0  # assumed between heartbeats: most robots send four a s
 class Level(Struct, frozen=True, kw_only=True):
     """The traffic that one level allows. A QoS of None is the channel's own.
 
-    At every level, a message that ends something is sent at once, with QoS 1.
+    At every level, a message that ends something (a zero, a release) is sent at once, with QoS 1.
     """
 
     drive_hz: float  # commands of one operator, a second

@@ -40,7 +40,7 @@ def without_name(topic: str) -> Named | None:
 
 
 def stop_topic(topic: str) -> str | None:
-    """Return a stop's topic without its accounts, valid or not; None if it has none, or is no topic of a stop."""
+    """Return a stop's topic without its accounts, even if they are invalid; None for a topic of any other form."""
     match = _STOP.fullmatch(topic)
     return None if match is None else match[1] + match[2]
 

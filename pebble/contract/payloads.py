@@ -164,7 +164,7 @@ class SoundboardCommand(Switch, frozen=True, kw_only=True):
     ``repeat`` is how often to play it, or true: until it is stopped. It is not written where it says nothing.
     """
 
-    repeat: Annotated[int, Meta(ge=0)] | bool | UnsetType | None = UNSET  # 0, false and null: once
+    repeat: Annotated[int, Meta(ge=0)] | bool | UnsetType | None = UNSET  # 0, false, null: once; UNSET: not written
 
 
 class AutonomyCommand(Switch, frozen=True, kw_only=True, omit_defaults=True):

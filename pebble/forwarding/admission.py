@@ -18,13 +18,13 @@ class Admission:
     """Limits on size, and on the number of actions and of messages that the contract does not know.
 
     Of unknown flags from outside a limited number is admitted. Flags from the robot's side are always admitted, and
-    count as well: so a restarted bridge counts those again that it had passed on before.
+    count as well: there a restarted bridge finds the retained ones that it had passed on before.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._flags: set[str] = set()
+        self._flags: set[str] = set()  # topics of unknown flags that were admitted, and were not removed since
         self._clock = clock
-        self._second = 0
+        self._second = 0  # the present one, whose messages are counted
         self._counts: dict[tuple[Kind | Channel, bool], int] = {}  # of this second, with a name and without one
 
     def __len__(self) -> int:

@@ -56,7 +56,7 @@ class CommandAges:
             clocks.pass_over(sender, sent_s, now)
             return waited_s
         if clocks.is_passed(sender, sent_s):
-            return inf  # it was sent again, with QoS 2 for example, after a newer one
+            return inf  # a newer one came before: this one was sent again, with QoS 2 for example
         return clocks.age_s(sender, sent_s, waited_s, now, subject.waits_s)
 
     def _key(self, command: Drive) -> str:

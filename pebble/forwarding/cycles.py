@@ -77,9 +77,9 @@ class Cycles:
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
         self._lock = threading.Lock()
-        self._ways: dict[tuple[Side, str], _Way] = {}
+        self._ways: dict[tuple[Side, str], _Way] = {}  # by the side from which messages come, and their topic
         self._ours: dict[bytes, Side] = {}  # our probes, and the side each was sent to
-        self._others: dict[tuple[Side, bytes], bool] = {}  # probes of other bridges that were relayed
+        self._others: dict[tuple[Side, bytes], bool] = {}  # probes of other bridges that were relayed; an ordered set
         self._stops: dict[tuple[Side, bytes], float] = {}  # when each was received last, by side and payload
         #: Messages from this side on this topic come back there if they are forwarded.
         self.closed_ways: Final[set[tuple[Side, str]]] = set()

@@ -37,7 +37,7 @@ log = logging.getLogger(__name__)
 
 _LOGGED = 200  # characters of a topic
 _STOP = f"/{ESTOP.metric}".encode()
-_NAMES = (Drop.UNNAMED, Drop.MISNAMED, Drop.UNREADABLE)
+_NAMES = (Drop.UNNAMED, Drop.MISNAMED, Drop.UNREADABLE)  # where senders are checked: these are logged
 _BOUNDS = (Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN, Drop.LATE, Drop.CIRCULATES, Drop.SIGNED, *_NAMES)
 _WARNED = (Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN)
 
@@ -74,7 +74,7 @@ class Mirroring:
         """True if no side sends our own messages back. Otherwise commands would be repeated, even after a stop."""
         if all(state.transport.exact_echo for state in self._sides.values()):  # then echo=False is kept to
             return True
-        if not self._was_refused:
+        if not self._was_refused:  # it is logged once
             self._was_refused = True
             log.error(
                 "remote-mirror is refused: a broker sends our own messages back; use one with bridge mode "
@@ -117,7 +117,7 @@ class Forwarder:
             (side, SideState(side, transport, self.counters, clock, wins=side is winner))
             for side, transport in transports.items()
         )
-        #: Results of :func:`route`. There are few subjects, so no bound is needed.
+        #: Results of :func:`route` by its arguments, see _route. There are few subjects, so no bound is needed.
         self._routes: dict[tuple[Side, Subject, QoS, bool, bool | None, bool], Forward | Drop] = {}
         self._admission = Admission(clock)
         self.ages = CommandAges()
@@ -144,7 +144,7 @@ class Forwarder:
         for drop, side in itertools.product(_BOUNDS, Side):
             counts[drop.name.lower()] += self.counters[f"{side.value}: {drop.value}"]
         counts["events"] = self.counters["events_dropped"]
-        if shed := self.counters["shed"]:
+        if shed := self.counters["shed"]:  # counted by an extension, on thin links
             counts["shed"] = shed
         return dict(counts)
 
@@ -209,8 +209,8 @@ class Forwarder:
     def _receive_named(self, source: SideState, names: Names, message: Message) -> Routed:
         """Forward a message whose sender is checked: the name moves from the topic into the payload."""
         sender = names[message.topic]
-        subject, by = sender.subject, sender.account  # Signed, below, adds the person for whom the account acts
-        outcome = self.admit(source, subject, message, sender.topic, by != NO_ACCOUNT)
+        subject, by = sender.subject, sender.account  # by: a Signed, below, adds the person for whom the account acts
+        outcome = self.admit(source, subject, message, sender.topic, by != NO_ACCOUNT)  # notes foreign ones, too
         if subject is None:
             outcome = sender.foreign  # why the topic means nothing to this robot
         elif isinstance(outcome, Forward):
@@ -232,7 +232,7 @@ class Forwarder:
     ) -> Forward | Drop:
         """Return how to forward ``message``, or why it does not pass. Must be fast.
 
-        ``topic`` is the topic on the other side. ``named`` is True if the sender has an account, or names do not count.
+        ``topic`` is the topic on the other side. ``named``: the sender has an account, or needs none.
         """
         if subject is not None and subject.is_stop:
             if not source.window.is_old_stop(message):
@@ -325,7 +325,7 @@ class Forwarder:
         tells_age = forward.stamped and STAMP_LETTER in message.payload and STAMP in message.payload
         waited_s = self.ages.waited_s(subject, message, account) if tells_age else message.waited_s
         late = waited_s > subject.waits_s and not ends_something(subject, message)
-        # Many late commands show a flood; not those that tell their age, whose senders keep to the pace of the link.
+        # Many late commands show a flood, but not those that tell their age: their senders keep to the link's pace.
         if forward.stamped and not (late and tells_age):
             self.note_age(late)
         return late
@@ -351,7 +351,7 @@ class Forwarder:
             payloads = list(self._pass_stop(source.side, message.payload))
             for payload in payloads:
                 self.publisher.publish(target, subject, Message(message.topic, payload, message.qos), forward)
-            return forward if payloads else Drop.RESET  # reset since that stop; or, in the mirror, it is for one owner
+            return forward if payloads else Drop.RESET  # all were reset since; or the mirror keeps one owner's copy
         if is_event:
             self.publisher.note_return(target, subject, message)
             target.events.send(message)

@@ -10,7 +10,7 @@ from typing import Final, TypeAlias
 
 from pebble.config import Config
 from pebble.contract import Channel
-from pebble.contract.payloads import ControlState, EstopCommand
+from pebble.contract.payloads import ControlState, EstopCommand, EstopState
 from pebble.extension import part
 from pebble.forwarding.routing import Drop, Side
 from pebble.forwarding.subjects import Subject
@@ -46,6 +46,9 @@ class Observer:
     def control(self, state: ControlState) -> None:
         """Note the state of control, as the deciding motor owner has published it."""
 
+    def estop(self, owner: str, state: EstopState) -> None:
+        """Note the state of the emergency stop, as a motor owner has published it."""
+
     def unconfirmed(self, owner: str, stop: EstopCommand) -> None:
         """Note a stop that is no longer repeated although a motor owner has not confirmed it."""
 
@@ -74,6 +77,9 @@ class Observers(Observer):
 
     def control(self, state: ControlState) -> None:
         self._tell("control", state)
+
+    def estop(self, owner: str, state: EstopState) -> None:
+        self._tell("estop", owner, state)
 
     def unconfirmed(self, owner: str, stop: EstopCommand) -> None:
         self._tell("unconfirmed", owner, stop)

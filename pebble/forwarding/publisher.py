@@ -69,7 +69,7 @@ class Publisher:
         topic, payload = message.topic, message.payload
         if (source.side, topic) in self._cycles.closed_ways and source.returns.is_echo(topic, payload):
             return True
-        # No other bridge, then, but maybe the side's own broker. Retained ones are recognised by their values instead.
+        # The side's own broker may have sent it back. A retained echo is recognised elsewhere, by its value.
         if source.transport.exact_echo or message.retain or not subject.is_two_way:
             return False
         return source.loopback.is_echo(topic, payload)
@@ -99,9 +99,9 @@ class Publisher:
         subject, target = self._subjects[topic], self._sides[side.other]
         if subject is None or not target.connected:
             return
-        # White space behind the topic's value; of a one-shot kind alone, because a copy of a command would run again.
+        # White space behind the topic's value; for a one-shot kind without the value, as a copy of a command would run.
         before = b"" if subject.kind.one_shot else value
-        if subject.kind.one_shot or _is_json(value):
+        if subject.kind.one_shot or _is_json(value):  # of other values white space would be a part
             probe = before + self._cycles.probe(side, topic)
             target.transport.publish(topic, probe, qos=QoS.DELIVERED, urgent=subject.kind in URGENT)
 

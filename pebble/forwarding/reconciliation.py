@@ -3,7 +3,7 @@
 A live message always counts, whichever side publishes it. `resolve` has the rules for the retained messages that a
 subscription brings. At a reconnect the *winner* side is right; the *loser* side only adds topics that the winner lacks.
 A side that has lost a value, or *went back* (was restored from an earlier save), receives the newest value again.
-Silence does not mean that a side has no value: the winner's value may arrive after the loser's was sent to it.
+Silence does not mean that a side has no value: the winner's may still arrive after the loser's was sent to the winner.
 """
 
 from __future__ import annotations
@@ -57,19 +57,19 @@ class Facts(NamedTuple):
 def resolve(sender: Side, payload: bytes, facts: Facts) -> Resolution:
     """Return the resolution for a retained message. The first line that fits counts; a live message always passes.
 
-    | sender | known of the topic                                | value             | then      |
-    |--------|---------------------------------------------------|-------------------|-----------|
-    | winner | the loser has changed it meanwhile                | any               | OVERTAKEN |
-    | winner | the winner went back                              | an earlier one    | CORRECT   |
-    | winner | any                                               | the newest one    | KNOWN     |
-    | winner | it was offered the loser's value                  | another one       | RESTORE   |
-    | winner | any                                               | another one       | PASS      |
-    | loser  | nothing, and the winner's messages have to arrive | any               | HOLD      |
-    | loser  | nothing, and they have arrived                    | any               | PASS      |
-    | loser  | any                                               | the newest one    | KNOWN     |
-    | loser  | the newest one is the winner's                    | another one       | CORRECT   |
-    | loser  | the loser went back                               | an earlier one    | CORRECT   |
-    | loser  | the newest one is the loser's                     | another one       | PASS      |
+    | sender | known of the topic                                | value          | then                             |
+    |--------|---------------------------------------------------|----------------|----------------------------------|
+    | winner | the loser has changed it meanwhile                | any            | OVERTAKEN: dropped               |
+    | winner | the winner went back                              | an earlier one | CORRECT: sender gets the newest  |
+    | winner | any                                               | the newest one | KNOWN: dropped                   |
+    | winner | it seemed to have none, and got the loser's       | another one    | RESTORE: published on both sides |
+    | winner | any                                               | another one    | PASS: published on the other     |
+    | loser  | nothing; the winner's messages have not arrived   | any            | HOLD: waits for these            |
+    | loser  | nothing; the winner's messages have arrived       | any            | PASS: published on the other     |
+    | loser  | any                                               | the newest one | KNOWN: dropped                   |
+    | loser  | the newest one is the winner's                    | another one    | CORRECT: sender gets the newest  |
+    | loser  | the loser went back                               | an earlier one | CORRECT: sender gets the newest  |
+    | loser  | the newest one is the loser's                     | another one    | PASS: published on the other     |
     """
     last = facts.last
     is_newest = last is not None and last.payload == payload
@@ -168,7 +168,7 @@ class Reconciliation:
         self._synchronized[side] = True
         due: list[tuple[Side, str, bytes]] = []
         if side is self._winner:
-            self._overtaken.clear()  # no older value of the winner is to come; for late ones there is _newer
+            self._overtaken.clear()  # the winner's values have come; for those that come late there is _newer
             for topic, payload in self._held.items():
                 self._set(topic, payload, side.other)
                 due.append((side, topic, payload))  # to the winner, which has none

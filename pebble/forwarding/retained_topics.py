@@ -26,15 +26,15 @@ class RetainedTopics:
         sides: Sides,
         subjects: Subjects,
         publisher: Publisher,
-        winner: Side,
-        both_ways: frozenset[Kind],
+        winner: Side,  # the one whose values count where the two sides differ
+        both_ways: frozenset[Kind],  # the kinds that pass in both directions
         on_value: Callable[[Subject, bytes], None],
     ) -> None:
         self._sides, self._subjects, self._publisher = sides, subjects, publisher
         self._both_ways, self._on_value = both_ways, on_value
         self._lock = threading.RLock()
         self._reconciliation = Reconciliation(winner)
-        self._waiting: dict[str, tuple[Subject, Message, Forward]] = {}
+        self._waiting: dict[str, tuple[Subject, Message, Forward]] = {}  # for the gate to open, by topic
 
     def receive(
         self, source: SideState, subject: Subject, message: Message, forward: Forward, *, only_old: bool = False
@@ -44,7 +44,7 @@ class RetainedTopics:
         ``only_old``: refuse a live message; what a broker had retained may pass.
         """
         with self._lock:
-            self._begin_restarted()
+            self._begin_restarted()  # first: this may be the first message of a new connection
             if subject.kind in self._both_ways:
                 drop = self._reconcile(source, subject, message, only_old=only_old)
                 if drop is not None:
@@ -53,8 +53,8 @@ class RetainedTopics:
             if gate is Gate.OPEN:
                 self._publish(source.side.other, subject, message, forward)
                 return forward
-            if gate is Gate.WAITING and source.side is Side.LOCAL:
-                if message.topic in self._waiting or len(self._waiting) < _MAX_WAITING:
+            if gate is Gate.WAITING and source.side is Side.LOCAL:  # the remote side is subscribed to once it is open
+                if message.topic in self._waiting or len(self._waiting) < _MAX_WAITING:  # others are dropped
                     self._waiting[message.topic] = subject, message, forward
                 return Drop.HELD
             return Drop.CLOSED
@@ -67,7 +67,7 @@ class RetainedTopics:
                 return Drop.CLOSED
             self._reconciliation.receive(Side.LOCAL, message.topic, message.payload, retained=False)
             self._on_value(subject, message.payload)
-            forward = Forward(QoS.DELIVERED, True, subject.kind in URGENT)
+            forward = Forward(QoS.DELIVERED, True, subject.kind in URGENT)  # True: retained
             for side in Side:
                 self._publish(side, subject, message, forward)
             return forward
@@ -121,10 +121,10 @@ class RetainedTopics:
     # -- with the lock held
 
     def _reconcile(self, source: SideState, subject: Subject, message: Message, *, only_old: bool) -> Drop | None:
-        """Return why a two-way message must not pass; None if it may. ``only_old``: a live message must not."""
+        """Return why a message of either side must not pass; None if it may. ``only_old``: no live message may pass."""
         side, topic, payload, transport = source.side, message.topic, message.payload, source.transport
         if message.retain and topic in source.seen and transport.policy.delivers_late and not transport.as_published:
-            return Drop.KNOWN  # certainly retained, and came late: it is older than the live one before it
+            return Drop.KNOWN  # without as_published its flag tells that it is old; a newer one came before it
         if len(source.seen) < _MAX_WAITING:
             source.seen.add(topic)
         retained = self._sides.gate is not Gate.SHUT and self._is_retained(source, message)  # shut: all count as live
@@ -142,7 +142,7 @@ class RetainedTopics:
             went_back=source.has_gone_back,
         )
         if resolution is Resolution.RESTORE:
-            self._publish_value(side, topic, payload)
+            self._publish_value(side, topic, payload)  # back to the sender's side; the caller sends it to the other
         if resolution in (Resolution.PASS, Resolution.RESTORE):
             self._on_value(subject, payload)
             return None

@@ -46,12 +46,12 @@ class RetainedWindow:
 
     def note(self) -> None:
         """Note a message with the retain flag. While such messages arrive, a stop may be an old one."""
-        now, until = self._clock(), self._stops_until  # only the time for stops is put off: not _until
-        if now >= until:
+        now, until = self._clock(), self._stops_until  # only for stops the end is put off: not _until
+        if now >= until:  # the window for stops is over
             return
         self._newest_at = now
         if until < float("inf"):  # the subscription is complete: so each message puts the end off
-            latest = self._subscribed_at + _RETAINED_STOPS_S
+            latest = self._subscribed_at + _RETAINED_STOPS_S  # whatever arrives
             self._stops_until = min(max(now + INITIAL_SYNC_S, until), latest)
 
     def is_old_stop(self, message: Message) -> bool:

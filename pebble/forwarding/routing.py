@@ -133,7 +133,7 @@ def _qos(subject: Subject, message: Message) -> QoS:
 
 
 def _retain(subject: Subject, message: Message) -> bool:
-    """True if a message is to be retained: as it was published or, where that is hidden, as its channel says."""
+    """True if a message is to be retained: as it was published or, where a broker hides that, as its channel says."""
     if subject.kind.one_shot:
         return False
     if subject.kind is Kind.FLAG and subject.retain:  # however it was published

@@ -25,7 +25,7 @@ class Gate(Enum):
 
 
 class SideState:
-    """A side: its transport, messages that wait for it or may come back, and its window of retained messages.
+    """A side: its transport, events that wait for it, messages that it may send back, and its window of retained ones.
 
     ``wins``: the retained messages of this side count where the two sides differ.
     """
@@ -51,7 +51,7 @@ class SideState:
         return self.transport.state is State.CONNECTED
 
     def subscribing(self) -> None:
-        """Note that the owner is about to subscribe: retained messages arrive from now on."""
+        """Note that subscribing to this side begins: its retained messages arrive from now on."""
         self.window.subscribing()
         self.seen.clear()
 
@@ -62,8 +62,8 @@ class SideState:
             self.subscribing()  # the transport does so at the next connection
             self.restarted = True
             self._lost_at = self._clock()
-            # A broker that ended may restore a save. Noted now, as its old messages may come before CONNECTED; for the
-            # side that wins only at CONNECTED, and only if the transport has found older values at its broker.
+            # A broker that ended may restore a save. For the side that does not win this is enough, and is noted now:
+            # old messages may come before CONNECTED. The side that wins needs `went_back`, known at CONNECTED.
             self._went_back = not self._wins and self.transport.was_ended
         elif self._wins:
             self._went_back = self._was_brief and self.transport.went_back  # brief: see RESTORED_S

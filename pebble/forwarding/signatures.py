@@ -17,8 +17,8 @@ _SCRIPT, _BACKSLASH = SCRIPT.encode(), 0x5C
 def unsigned(payload: bytes) -> bytes | None:
     """Return a drive command without a script's signature, or the same object if it has none; None: it must not pass.
 
-    Must be fast: a person's command is rarely decoded. JSON may spell the name of a field with backslashes. A payload
-    that holds one or the name, and cannot be decoded, does not pass: the parser of a board may be more lenient.
+    Must be fast: a person's command is rarely decoded. JSON may spell SCRIPT, a script's source, with backslashes. A
+    payload with SCRIPT or a backslash that cannot be decoded does not pass: a board's parser may be more lenient.
     """
     if _BACKSLASH not in payload and _SCRIPT not in payload:
         return payload

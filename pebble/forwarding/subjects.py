@@ -94,7 +94,7 @@ class Subjects(dict[str, Subject | None]):
     """Subjects by effective topic, those of all serial instances included.
 
     The subject is None for a topic that is invalid or not this robot's. A topic that was looked up before is found
-    without calling a Python function. ``config``: the robot's; its base is enough if no topic is renamed.
+    without calling a Python function. ``config``: the robot's, or only its base if no topic is renamed.
     """
 
     def __init__(self, config: Config | str) -> None:
@@ -109,7 +109,7 @@ class Subjects(dict[str, Subject | None]):
             self._addresses = [Addresses(view_of(config, instance)) for instance in instances]
         self._between_robots = tuple(f"{self._base}/{family}" for family in BETWEEN_ROBOTS)
         self._incoming = f"{self._base}/{INCOMING}/".encode()
-        topics = (topic.encode() for topic in self.topics(*CHANNELS))  # those elsewhere stay whole, unlike any metric
+        topics = (topic.encode() for topic in self.topics(*CHANNELS))  # one elsewhere stays whole: it equals no metric
         self._known_metrics = frozenset(topic.removeprefix(self._incoming) for topic in topics)
 
     def __missing__(self, topic: str) -> Subject | None:
@@ -160,7 +160,7 @@ class Subjects(dict[str, Subject | None]):
         except TransportError:
             return None
         if topic.startswith(self._between_robots):
-            return None
+            return None  # such topics are never forwarded
         for addresses in self._addresses:
             channel = addresses.channel(topic)
             if channel is not None:

@@ -30,10 +30,10 @@ class AnnouncerPipe:
     """
 
     def __init__(self, reactor: Reactor) -> None:
-        self.dropped = 0  # records
+        self.dropped = 0  # records, and messages that are too long
         self._reactor = reactor
-        self._retry: Timer | None = None
-        self._states: dict[str, Message] = {}
+        self._retry: Timer | None = None  # for another attempt to send states
+        self._states: dict[str, Message] = {}  # the newest of each topic
         self._unsent: dict[str, Message] = {}  # states that the present announcer has not received
         self._socket: socket.socket | None = None
 
@@ -77,10 +77,13 @@ class AnnouncerPipe:
         self._retry = None
         self._send_states()
 
-    def _send(self, kind: Kind, message: Message) -> bool:
+    def _send(self, kind: Kind, message: Message) -> bool:  # False: no announcer, or no room now
         raw = msgspec.msgpack.encode(Envelope(kind, message))
-        if self._socket is None or len(raw) > ENVELOPE_LIMIT:
+        if self._socket is None:
             return False
+        if len(raw) > ENVELOPE_LIMIT:  # another attempt would fail, too, and hold up what comes after
+            self.dropped += 1
+            return True
         try:
             self._socket.send(raw)
         except BlockingIOError:

@@ -1,4 +1,4 @@
-"""Judges, by the notes of the robot's processes, whether drive commands and stops reach the motors. Pure.
+"""Judges, by processes' notes (pebble.runtime.notes), whether drive commands and stops reach the motors. Pure.
 
 A judgement is a state, "no", "unknown" or "yes", with the reason unless it is "yes".
 """
@@ -28,7 +28,7 @@ def _starts(mcu: Mcu) -> str:
 
 
 def _drives(mcu: Mcu) -> tuple[str, str]:
-    """Return the judgement of a board. Silence alone is "unknown": some boards are silent by design."""
+    """Return the judgement of a board. Its silence is "unknown", unless it normally sends all the time (`Mcu`)."""
     match mcu.state:
         case "absent":
             return _NO, mcu.why or "there is no such device"
@@ -44,7 +44,7 @@ def _drives(mcu: Mcu) -> tuple[str, str]:
 
 
 class Driveable:
-    """The newest notes Mcu, Local and Reach of all programs; ``on_change()`` is called when the judgement may change.
+    """The newest Mcu, Local and Reach notes of all programs; ``on_change()`` is called when the judgement may change.
 
     ``lines``: the name of each serial line by its program. ``owners``: the programs that drive motors. ``ways``: the
     programs through which drive commands reach the owners, and which must receive the owners' messages.

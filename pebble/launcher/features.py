@@ -1,4 +1,4 @@
-"""The features that the robot's processes report, for the capabilities message. Pure."""
+"""The features that the robot's processes report by notes to the launcher, for the capabilities message. Pure."""
 
 from collections.abc import Callable
 
@@ -10,7 +10,7 @@ _MOST_REPORTS = 256  # of all processes; a self-describing MCU names its own out
 
 
 class Features:
-    """The newest notes Feature of all programs; ``on_change()`` is called when a property changes.
+    """The newest Feature notes of all programs; ``on_change()`` is called when a property changes.
 
     ``estop``: the emergency stop. ``control``: requests for control are answered. ``outlets/NAME/status`` and
     ``outlets/NAME/power``: the contract's topics of a power outlet are in use.

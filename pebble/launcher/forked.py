@@ -90,9 +90,9 @@ def _run(program: Program) -> None:
     die_with_launcher()
     ctypes.CDLL(None).prctl(_PR_SET_NAME, program.name.encode()[:_NAME_BYTES])  # ps and top show it
     sys.argv = [program.module, *program.arguments]
-    if ":" in program.module:
+    if ":" in program.module:  # module:function
         sys.exit(run(part(program.module)))
-    if not hasattr(sys.modules.get(program.module), "__path__"):
+    if not hasattr(sys.modules.get(program.module), "__path__"):  # of a package its __main__ runs: it stays
         sys.modules.pop(program.module, None)  # imported before the fork; python -m has it as __main__ only
     runpy.run_module(program.module, run_name="__main__", alter_sys=True)
 

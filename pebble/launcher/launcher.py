@@ -70,11 +70,11 @@ class Launcher:
         """
         config = self._config
         if config.path is not None:
-            # root must not run the commands that another user writes into a config
+            # root must not run the commands that another user writes into a config; there=True: it has to exist
             require_own(config.path, does="runs nothing of it", there=True)
         own_records = OwnRecords(self._logs, config.log_level)
-        in_state_dir = config.state_file("launcher").with_suffix(".lock")
-        with own_records, RunLock(config.run_dir(), config.base, in_state_dir) as lock:
+        lock_in_state_dir = config.state_file("launcher").with_suffix(".lock")
+        with own_records, RunLock(config.run_dir(), config.base, lock_in_state_dir) as lock:
             self._signals.install()
             for place in filter(None, (extension.prepare for extension in config.installed)):
                 part(place)(config)
@@ -118,14 +118,14 @@ class Launcher:
         )
 
     def _driveable_by(self, running: Collection[str]) -> Driveable:
-        """Return the judge of the motors that the programs ``running`` own."""
+        """Return the `Driveable` of the programs ``running``: of their motors, and of serial lines without motors."""
         lines = {program_of(name): self._config.motor_owner(name) for name in self._config.serial_instances()}
         by_extensions = {program: name for name, program in motors_of(self._config.installed, self._config).items()}
         owners = [*map(program_of, self._config.motor_lines()), *by_extensions]
         return Driveable(
-            {program: name for program, name in (lines | by_extensions).items() if program in running},
-            [program for program in owners if program in running],
-            ["mqtt_bridge"] if "mqtt_bridge" in running else [],
+            {program: name for program, name in (lines | by_extensions).items() if program in running},  # with a state
+            [program for program in owners if program in running],  # with motors
+            ["mqtt_bridge"] if "mqtt_bridge" in running else [],  # through which drive commands come
             lambda: self._status.changed(),
         )
 

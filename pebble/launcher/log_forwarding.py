@@ -33,7 +33,7 @@ class LogForwarder:
         self._readers: dict[str, tuple[int, LevelReader]] = {}  # with the process id, by service
 
     def child_line(self, service: str, pid: int, line: str, *, published: bool = True) -> None:
-        """Forward a line of a child. The announcer's lines are not published: each could cause another line."""
+        """Forward a child's line. Lines of .announcer, which publishes, are not published: each could cause another."""
         last_pid, reader = self._readers.get(service, (pid, None))
         if reader is None or last_pid != pid:  # the level of the last line belongs to the previous process
             reader = LevelReader()
@@ -112,8 +112,8 @@ class NonBlockingWriter:
 class LevelReader:
     """A reader of the levels of one process's lines: ``HH:MM:SS [LEVEL] text``; other lines are INFO (paper A.8.7).
 
-    A traceback, up to the next line that names its level, has the level of the line before it, or ERROR. Indented lines
-    continue the line before them.
+    A traceback, up to the next line that names its level, has the level of the line before it; ERROR if that names
+    none. Indented lines continue the line before them.
     """
 
     def __init__(self) -> None:

@@ -17,15 +17,15 @@ log = logging.getLogger(__name__)
 
 
 class OnDemand:
-    """The requests in the notes Wanted and Held: a program runs while it is wanted and not held. For one thread."""
+    """The requests in Wanted and Held notes: a program runs while it is wanted and not held. For one thread."""
 
     def __init__(self, reactor: Reactor, supervisors: Iterable[ProcessSupervisor]) -> None:
         self._reactor = reactor
         self._supervisors = {s.program.name: s for s in supervisors if s.program.on_demand}
-        self._wanted: dict[str, bool] = {}  # by program, as the rest
+        self._wanted: dict[str, bool] = {}  # by the requested program, as the rest: what the newest note says
         self._held: dict[str, bool] = {}
         self._encodings: dict[str, str] = {}  # with which a program begins, whenever it is started
-        self._until: dict[str, float] = {}  # when requests of an ended program expire
+        self._until: dict[str, float] = {}  # when a request expires whose sender has ended
         self._refused: set[str] = set()  # programs whose first refused note was logged
 
     @property
@@ -33,7 +33,7 @@ class OnDemand:
         return tuple(name for name in self._supervisors if self._wanted.get(name))
 
     def environment(self, program: Program) -> dict[str, str]:
-        """Return variables for a new process: what an earlier one has requested, or the encoding to begin with."""
+        """Return a new process's variables: its last process's requests, or an on-demand program's encoding."""
         if program.may_request:
             return {WANTED: " ".join(f"{name}={self._encodings[name]}" for name in self.requested)}
         return {ENCODING: self._encodings[program.name]} if program.on_demand else {}

@@ -231,7 +231,7 @@ class ProcessSupervisor:
             self._reactor.watch(child.exited, lambda: self._exited(child))
             return
 
-        def ask() -> None:
+        def ask() -> None:  # repeatedly, as the system has no descriptor: see pebble.runtime.exits
             if has_ended(child.pid):
                 self._exited(child)
             else:
@@ -248,7 +248,7 @@ class ProcessSupervisor:
         how = child.end()
         self._child = None
         self._cancel_timer()
-        if self.state not in (ProgramState.RUNNING, ProgramState.STUCK):
+        if self.state not in (ProgramState.RUNNING, ProgramState.STUCK):  # it was asked to end
             self._ended_as_asked(how)
         elif self._is_stopping():
             log.info("%s ended (%s) before its turn to stop", self.program.name, how)

@@ -29,7 +29,7 @@ class Reactor:
         self._selector = selectors.DefaultSelector()
         self._timers = Timers()
         self._clock, self._on_stall = clock, on_stall
-        self._stood_still_s = 0.0
+        self._stood_still_s = 0.0  # the sum of all stalls, which this clock leaves out
         self._read_at: float | None = None  # when the clock was last read; None while nothing runs
 
     def now(self) -> float:
@@ -39,7 +39,7 @@ class Reactor:
             before, self._read_at = self._read_at, now
             passed_s = now - before
             if passed_s > _TURN_S + _STALL_S:
-                self._stood_still_s += passed_s - _TURN_S  # counts as a turn: else a starved process would run no timer
+                self._stood_still_s += passed_s - _TURN_S  # the clock goes on by a turn: else no timer might come due
                 self._on_stall(passed_s)
         return now - self._stood_still_s
 

@@ -29,8 +29,8 @@ class RestartPolicy:
         #: When, without a further sign of life, the process counts as stuck.
         self.stuck_at = float("inf")
         self._delay_s = restart_delay_s
-        self._exits: deque[float] = deque(maxlen=LOOP_EXITS)
-        self._exits_in_a_row = 0
+        self._exits: deque[float] = deque(maxlen=LOOP_EXITS)  # when it ended unexpectedly: is it a crash loop?
+        self._exits_in_a_row = 0  # unexpected ones, by which the wait grows; from 1 again after STABLE_S of running
         self._started = float("-inf")
 
     @property

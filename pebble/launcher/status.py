@@ -54,7 +54,7 @@ class StatusPublisher:
         interval_s = self._config.services.defaults.retained_publish_interval_seconds
         if self._systemd.watchdog_period_s is not None:
             self._reactor.every(self._systemd.watchdog_period_s, self._systemd.watchdog)
-        if launcher.enabled:
+        if launcher.enabled:  # the key is for capabilities and logs: the status is always published
             self._publish_capabilities()
             self._reactor.every(interval_s, self._publish_capabilities)
         self.changed()
@@ -92,7 +92,7 @@ class StatusPublisher:
     def publish_last(self) -> None:
         """Publish the status, which says how all other programs ended, before the announcer stops."""
         if self._pipe.dropped:
-            text = "log records that were not published, because the announcer was away or busy: %d"
+            text = "messages that were not published (too long, or the announcer was away or busy): %d"
             log.info(text, self._pipe.dropped)
         self._publish_status()
 

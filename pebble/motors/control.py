@@ -81,7 +81,7 @@ class Control:
             self.lease.hold(client, int(request.for_ms), over, ms(now))
 
     def vouch(self, vouched: ControlVouched, now: float) -> None:
-        """Note the period for which the bridge vouches that it has forwarded every message."""
+        """Note the period in which the bridge has forwarded all messages: a holder's silence counts only within it."""
         self.lease.vouch(vouched.begin, vouched.end, ms(now))
 
     def doubt(self, now: float) -> None:

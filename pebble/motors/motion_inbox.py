@@ -59,9 +59,9 @@ class Batch(Struct):
 class MotionInbox:
     """A bounded inbox. Any thread may put, one takes. ``put`` returns True if the inbox was empty: then wake the taker.
 
-    Of each sender the newest drive command waits, and before it a zero that it replaced, which may end a script or the
-    wait after a reset. The holder of control is a sender apart, so that no other replaces its commands. So is each
-    client that requests control, by account and id as in the lease: one account may be used by any number of persons.
+    Of each sender the newest drive command waits. If it replaces a zero, the zero waits before it: a zero may end a
+    script, or the wait after a reset. The holder of control is a sender apart, so that no other replaces its commands.
+    So is each client that requests control, by account and id as in the lease: several persons may use one account.
     """
 
     def __init__(self, control: Control) -> None:
@@ -100,10 +100,10 @@ class MotionInbox:
             sender = self._control.sender(request)
             waiting = self._requests.pop(sender, None)
             if len(self._requests) >= _REQUESTS:
-                knows = self._control.knows  # a client gives way that neither has control nor is the first to ask
+                knows = self._control.knows  # true of the holder, and of the first that asks: these requests stay
                 del self._requests[next(key for key, received in self._requests.items() if not knows(received.request))]
                 self.dropped += 1
-            waiting_takes_over = waiting is not None and waiting.over  # a renewal must not undo that
+            waiting_takes_over = waiting is not None and waiting.over  # which a renewal of the request must not undo
             over = not request.ends() and (over or waiting_takes_over)
             self._requests[sender] = ReceivedRequest(request, over, now)
             return was_empty

@@ -108,10 +108,10 @@ class MotorGuard:
         if self._latch.reset(reset.boot, reset.count, ms(age_s), ms(now)):
             self._log.log("reset", logging.WARNING, "emergency stop reset by %s", _described(_given(reset.by), ""))
             self._save()
-        elif self._latch.reset_refused:
+        elif self._latch.reset_refused:  # else it was not latched
             why = _REFUSED_RESETS[self._latch.reset_refused]
             self._log.log("refused", logging.WARNING, "refused a reset: %s", why)
-        self._state.changed(now)
+        self._state.changed(now)  # a refusal is part of the state
 
     def judge(self, drive: Drive, now: float) -> float | None:
         """Judge a drive command; return the seconds for which it moves the motors (0: stop), None if it is refused."""
@@ -163,7 +163,7 @@ class MotorGuard:
             self._state.changed(now)
 
     def save_again(self) -> None:
-        """Write the file once it can be written at all; write it again if the last write failed, or it was removed.
+        """Write the file as soon as that is possible; write it again if the last write failed, or the file was removed.
 
         It is not written again while a write is still running, or in a folder that is lost, where every write fails.
         """
@@ -185,7 +185,7 @@ class MotorGuard:
             return None
         latch = Latch("", NAMES, operator.sub)
         latch.restore(saved)
-        newest = latch.recent[0] if latch.recent else secrets.token_hex(8)
+        newest = latch.recent[0] if latch.recent else secrets.token_hex(8)  # an unreadable file is a stop, too
         if latch.latched and not self.latched and newest not in self._latch.recent:
             log.warning("%s has appeared, with an emergency stop", self._file.path)
             return EstopCommand(stop=newest, by=latch.by, why=latch.why)

@@ -102,7 +102,7 @@ class MotorOwner(Service, ABC):
         self.move(drive, valid_s)
 
     def accompany(self, company: tuple[groups.Member, ...]) -> None:
-        """Carry out the members of a group without a drive command; on the service's thread."""
+        """Carry out ``company``, the members of a group that has no drive command; on the service's thread."""
 
     def report(self, able: bool, why: str = "") -> None:
         """Tell the launcher whether the motors can be moved, or why not; the robot's status has it as ``driveable``."""
@@ -269,7 +269,7 @@ class MotorOwner(Service, ABC):
 
     @property
     def _latches(self) -> bool:
-        """True if an emergency stop latches: the broker accepts both its topic and the topic of resets."""
+        """True if an emergency stop latches: the broker lets us subscribe to stops and to the resets that end them."""
         return not (self.refused(c.ESTOP) or self.refused(c.ESTOP_RESET))
 
     def on_connected(self) -> None:
@@ -340,7 +340,7 @@ class MotorOwner(Service, ABC):
         self._arm_guard()
 
     def _publish_state(self, state: p.EstopState) -> None:
-        """Publish ``state``; while stops do not latch, clear its topic at each call: a bridge may miss a clearing."""
+        """Publish ``state`` or, if stops do not latch, clear its topic at each call, because a bridge may miss one."""
         if self._latches:
             self.publish(c.ESTOP_STATE, state, owner=self.owner)
         else:

@@ -14,7 +14,7 @@ SETTLES_MS = FOLLOWS_MS + 100
 
 
 class SharedLease(VouchedLease):
-    """The lease of an only owner, and the base class of the two below, which refuse motion while holders may differ."""
+    """The lease of an only owner, and the base of two that refuse motion while owners may disagree who has control."""
 
     until = sys.maxsize  # when everything stops, unless another turn is received before
 
@@ -92,7 +92,7 @@ class FollowingLease(SharedLease):
             self.key = turn.key
         asker = ("", turn.asks_id, turn.asks, "") if turn.asks_id else ()  # a turn has neither its account nor device
         self.changed = self.changed or (asker, turn.others) != (self.asker, self.others)
-        self.asker, self.others = asker, turn.others  # others: a command without a key has just passed there
+        self.asker, self.others = asker, turn.others  # others: as at the first owner, see Lease
 
     def shown(self, _barred: int, _now: int) -> ControlTurn | None:
         turn = self._followed

@@ -52,7 +52,7 @@ class StateFile:
             return True
 
     def can_save(self) -> bool:
-        """True if a write may be tried: its folder can be written or made, or is :attr:`lost`, as a write reports."""
+        """True if a write may be tried: its folder can be written or made, or is :attr:`lost`: a write reports that."""
         existing = next(folder for folder in self.path.parents if os.access(folder, os.F_OK))
         return self.lost or (existing.is_dir() and os.access(existing, os.W_OK | os.X_OK))
 
@@ -81,7 +81,7 @@ class StateFile:
             return Unreadable()
 
     def appeared(self) -> Any:
-        """Return what :meth:`load` reads, on a disk mounted late for example; None if this process wrote the file."""
+        """Return what :meth:`load` reads if the file there is not this process's own (a disk came late); else None."""
         try:
             return None if self._own is not None and not self._own.replaced else self.load()
         except OSError:
@@ -132,7 +132,7 @@ class StateFile:
             make_folder(self.path.parent)
             write(self.path, json.dumps(value).encode(), 0o600, PebbleError)
             self._own = OwnFile(self.path)
-            if self.lost:
+            if self.lost:  # written all the same: this container can read it
                 raise PebbleError(f"NOT SAVED: no volume holds {self.path.parent}, so a stop ends with this container")
         except (PebbleError, OSError) as error:
             self._log.log("failed", logging.ERROR, "the state cannot be written: %s", error)

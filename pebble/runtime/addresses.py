@@ -16,7 +16,7 @@ class Address(NamedTuple):
 
 
 class Addresses:
-    """A table of the addresses of all channels. ``config``: the robot's; its base is enough if no topic is renamed."""
+    """A table of the addresses of all channels. ``config``: the robot's, or only its base if no topic is renamed."""
 
     def __init__(self, config: Config | str) -> None:
         self.base = config if isinstance(config, str) else config.base

@@ -1,4 +1,4 @@
-"""Lets root work in another user's folder with that user's rights only: a link there leads to nothing beyond them."""
+"""Lets root work in another user's folder with that user's rights only, so that a link there opens nothing else."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ def check_connections(config: Config) -> None:
 
 
 def local_settings(config: Config, as_published: bool = False) -> Any:
-    """Return the settings of the local transport; for a third party's transport they are ``transport.settings``."""
+    """Return the local transport's settings, a third party's as in the config. ``as_published``: see `MqttSettings`."""
     kind = config.transport.kind
     if kind == "mqtt":
         settings = mqtt_settings(config.local_mqtt, as_published=as_published, reconnect_max_s=LOCAL_RECONNECT_S)
@@ -89,7 +89,7 @@ def stops_transport(config: Config) -> Transport | None:
     """Return the bridge's second connection to operators, only for stops; None if there is none.
 
     At the level ``open`` there is one only if the link may be thin: on such a link a client that sends too much fills
-    the first connection. The second connection is not ``as_published``.
+    the first connection. The second one is not opened ``as_published`` (see :class:`Message`).
     """
     bridge = config.services.mqtt_bridge
     if config.security.level == "open" and (bridge.remote is not None or bridge.link.profile == "wide"):
@@ -173,7 +173,7 @@ def _renamed_vital(config: Config) -> tuple[str, ...]:
 
 def _renamed(config: Config) -> Iterator[tuple[c.Channel, str]]:
     """Yield the channels that this config renames, and their topics, for every serial line."""
-    section = config.services.serial_mcu_bridge  # of all lines; in the process of one line that line's
+    section = config.services.serial_mcu_bridge  # of all lines; a process of one line has its own section here
     for line in (section, *config.serial_instances().values()):
         addresses = Addresses(replace(config, services=replace(config.services, serial_mcu_bridge=line)))
         for channel in c.CHANNELS:

@@ -1,4 +1,4 @@
-"""Runs the Zenoh hub: inside a robot's announcer, or as a program on another machine."""
+"""Runs the Zenoh hub: in a robot's process pebble.launcher.announcer, or as a program on another machine."""
 
 import logging
 import threading

@@ -83,7 +83,7 @@ def view_of(config: Config, instance: str) -> Config:
 def exit_at_the_latest() -> None:
     """End the process after 3 s even if stopping hangs. Hardware that moves also has its own deadline.
 
-    The kernel ends it: this is called in signal handlers, where starting a thread may wait for ever.
+    The kernel ends the process: this is called in signal handlers, where starting a thread may wait for ever.
     """
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.setitimer(signal.ITIMER_REAL, _STOP_DEADLINE_S)

@@ -168,7 +168,7 @@ class Service:
         deliver = deliver_direct if direct else partial(self._deliver, channel, method)
         receive = self.refusals.reader(channel, deliver, self._remark)
         topic = self.addresses[channel].topic
-        return self.transport.subscribe(topic, receive, qos=QoS(channel.default_qos), direct=True)
+        return self.transport.subscribe(topic, receive, qos=QoS(channel.default_qos), direct=True)  # `receive` is quick
 
     def refused(self, channel: Channel) -> bool:
         """True if the other end refuses to deliver ``channel`` to its ``@on`` method (T21 in docs/transports.md)."""
@@ -202,7 +202,7 @@ class Service:
             if self._inbox:
                 return False
             job()
-            if self.timers.next_due < work.wakes_at:  # by ``job``: the service's thread must not sleep until then
+            if self.timers.next_due < work.wakes_at:  # ``job`` has set an earlier timer than the service's thread knows
                 self._inbox.wake()
         except Exception as failure:  # noqa: BLE001 - raised again on the service's thread, which it ends
             self.post_first(partial(_fail, failure))
@@ -251,7 +251,7 @@ class Service:
             if job is not None:
                 job()
             self.timers.run_due(self.clock())
-            self._work.wakes_at = self.timers.next_due
+            self._work.wakes_at = self.timers.next_due  # for `run_if_idle` on other threads
         return job is not None
 
     def _tear_down(self) -> None:
@@ -290,7 +290,7 @@ class Service:
     def _handle(self, channel: Channel, method: Callable[[], None], arrived: float) -> None:
         """Call the handler, unless the message has waited too long in a hung or suspended process.
 
-        Only commands on channels with ``newest`` are dropped.
+        Only commands of which a newer one replaces a waiting one (``Channel.newest``) are dropped.
         """
         if channel.kind is Kind.COMMAND and channel.newest and self.clock() - arrived > WAIT_LIMIT_S:
             self.count_late(channel)

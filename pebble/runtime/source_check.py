@@ -49,7 +49,7 @@ class SourceCheck:
         self.content, self._at = content, now
 
     def count(self, times: int, now: float) -> None:
-        """Add ``times`` contents that have come since the last call."""
+        """Count contents, for the rate. ``times``: how many have come since the last call."""
         if self._window is None:
             self._window, self._count = now + _SETTLE_S, -1  # the source settles first
         if now < self._window:

@@ -42,7 +42,7 @@ def set_mode(file: Path, mode: int, opened: Path | int | None = None) -> None:
 
 
 def sync_file(descriptor: int, *, data: bool = False) -> None:
-    """Write a file to the disk, or only its ``data``, if its file system can. Raises OSError if data may be lost."""
+    """Write a file to disk, or only its ``data``, where the system can do so. Raises OSError if data may be lost."""
     try:
         (os.fdatasync if data else os.fsync)(descriptor)
     except OSError as error:

@@ -55,7 +55,7 @@ def steps(bundle: int, bitrate: int) -> tuple[Step, ...]:
 class RateController:
     """A controller of the packets that are sent, and of their Opus encoding (``step``).
 
-    ``outgoing()`` returns the unacknowledged messages. ``thin``: after a slow packet there is a pause.
+    ``outgoing()`` returns the unacknowledged messages. ``thin``: the link may be thin; a pause follows a slow packet.
     """
 
     def __init__(
@@ -105,12 +105,12 @@ class LevelControl:
 
     def __init__(self, last: int, now: float) -> None:
         self.level = self._last = last  # which step; 0 is as configured
-        self._slow_since: float | None = None
-        self._fast_since: float | None = None
+        self._slow_since: float | None = None  # since when packets wait too long
+        self._fast_since: float | None = None  # since when none does
         self._polled_at = float("-inf")
         self._empty_at = float("-inf")  # when nothing waited
         self._changed_at = now
-        self._raised_at = float("-inf")
+        self._raised_at = float("-inf")  # when the quality last rose
         self._calm_s = _FIRST_CALM_S  # how long it has to be fast before a step up
 
     def poll(self, age_s: float, now: float) -> bool:

@@ -35,7 +35,7 @@ class AudioPublisher(Service):
         super().__init__(*arguments, **options)
         self._options = section = self.config.section(Media).audio_publisher
         self._stopping = False
-        self._received_at = self.clock()
+        self._received_at = self.clock()  # the newest piece of sound
         self._remote = remote_transport(self.config, "audio-publisher")
         self._address = self.addresses[AUDIO]
         thin = self.config.services.mqtt_bridge.link.profile != "wide"
@@ -43,10 +43,10 @@ class AudioPublisher(Service):
             section.bundle, section.bitrate, self._received_at, lambda: self._remote.outgoing, thin=thin
         )
         self._meter, self._numbers = RateMeter(), sequence_numbers()
-        self._requested = self._known(requested_encoding())
+        self._requested = self._known(requested_encoding())  # the encoding that is wanted now
         self._encoder: SoundEncoder | None = None
-        self._made_for: tuple[object, ...] = ()  # encoding, rate and channels
-        self._made_step: Step | None = None
+        self._made_for: tuple[object, ...] = ()  # for what the encoder was made: encoding, rate and channels
+        self._made_step: Step | None = None  # and for which step of the rate control
         self._problem = ""  # why sound is not sent as requested
         self.reduced = ""  # because of a slow connection
         self._reader = FrameReader(self.config.run_dir(), "microphone", sharing=False, depth=_DEPTH)
@@ -104,6 +104,7 @@ class AudioPublisher(Service):
             return
         self._rate.poll(now, self.encoding)
         encoder = self._encoder_for(info.rate, info.channels)
+        # captured_ms is when the piece was complete: the time of its end.
         first_ms = info.captured_ms - round(1000 * len(pcm) / (2 * info.channels * info.rate))
         for packet in encoder.encode(pcm, first_ms):
             self._send_packet(packet, now)
@@ -121,7 +122,7 @@ class AudioPublisher(Service):
     def _encoder_for(self, rate: int, channels: int) -> SoundEncoder:
         """Return the encoder, or another one if its settings must change.
 
-        A change of the step waits for the end of a packet.
+        If only the rate control's :class:`Step` changes, that waits for the end of a packet.
         """
         step = self._rate.step if self._requested == "opus" else self._rate.configured
         needed = (self._requested, rate, channels)

@@ -89,6 +89,7 @@ class Player:
         return child
 
     def _write(self, child: Child, data: bytes) -> None:
+        """Write samples to the program. One that has ended, or takes nothing for _STUCK_S, is started again later."""
         unwritten = memoryview(data)
         deadline = time.monotonic() + _STUCK_S
         poll = select.poll()
@@ -106,6 +107,7 @@ class Player:
             if time.monotonic() > deadline:
                 self._died(f"{self._name} takes no more sound")
                 return
+        # A program that fails soon after its start may have taken some sound before that.
         if self.problem and time.monotonic() - self._started_at > _BACK_OFF_S:
             log.info("sound is played again")
             self.problem = ""

@@ -66,7 +66,7 @@ class _Answer(NamedTuple):
     description: Description
     ours: bool = False
     problem: str = ""
-    broken: bool = False
+    broken: bool = False  # because of ``problem`` it cannot be started; else it only has no settings
     asked: bool = True  # False: what it says itself is not known yet
     drives: bool = True  # False: it says itself that it only measures, and never drives
 
@@ -102,6 +102,7 @@ class Catalogue:
         tell(scripts)
 
     def _scripts(self, folders: Mapping[str, list[Path]], *, asks: bool) -> dict[str, Script]:
+        """Return the scripts by their names. ``asks`` False: run none of them now, see :meth:`_describe`."""
         scripts = {}
         for name, places in folders.items():
             candidates = (self._script(name, folder, asks=asks) for folder in places)
@@ -139,6 +140,7 @@ class Catalogue:
         return sections.get(meant(sections, name), ScriptSection())
 
     def _script(self, name: str, folder: Path, *, asks: bool) -> Script | None:
+        """Return the script in a folder; None if it has neither an entry point nor a command of its own."""
         section = self._section_of(name)
         entry = folder / section.entrypoint
         answer = self._answer(name, folder, entry, section, asks=asks)
@@ -204,13 +206,14 @@ class Catalogue:
         if not ours or not self._asks:  # this catalogue never runs a script
             return _Answer(described, ours, problem)
         if not asks:  # it is ours, and is asked later
-            return _Answer(described, True, problem, asked=False)
+            return _Answer(described, ours, problem, asked=False)
         command = self._command(folder, entry, section, described, ours=True)
         try:
             answer = ask(command, folder, environment(section.env))
-            return _Answer(_merged(described, answer), True, problem, drives=answer.drives)
+            return _Answer(_merged(described, answer), ours, problem, drives=answer.drives)
         except DescribeError as error:
-            return _Answer(described, True, str(error), isinstance(error, BrokenScriptError))
+            is_broken = isinstance(error, BrokenScriptError)
+            return _Answer(described, ours, str(error), is_broken)
 
     def _command(
         self, folder: Path, entry: Path, section: ScriptSection, described: Description, *, ours: bool
@@ -233,8 +236,8 @@ class Catalogue:
     ) -> tuple[Setting, ...]:
         """Return the config's settings, and then those that only the script gives.
 
-        Of a setting in both, the config's counts. But our scripts read their options themselves: how such an option is
-        written on the command line is as the script says, and one that the script does not know is left out.
+        Of a setting in both, the config's counts. But our scripts read their options themselves: so their settings are
+        written on the command line in the script's form, and a setting of the config that the script lacks is left out.
         """
         configured = [Setting(**asdict(argument)) for argument in section.args]
         options = {setting.key: setting for setting in described.configs}
@@ -262,18 +265,19 @@ class Catalogue:
 
 
 def files(scripts: Iterable[Script]) -> list[dict[str, object]]:
-    """Return the ``files`` of `autonomy-files`, without forms if they would make it too long."""
+    """Return the ``files`` of `autonomy-files`; from the first form on that would make it too long, without forms."""
     entries: list[dict[str, object]] = []
     room = _LONGEST_FILES
     for script in scripts:
         configs = form(script.settings)
         room -= len(msgspec.json.encode(configs))
         configs = configs if room >= 0 else []
-        entries.append({"file": script.file, "label": script.label, "configs": configs, **_first_seen(script, configs)})
+        entry = {"file": script.file, "label": script.label, "configs": configs}
+        entries.append(entry | _optional_fields(script, configs))
     return entries
 
 
-def _first_seen(script: Script, configs: Iterable[Mapping[str, object]]) -> dict[str, object]:
+def _optional_fields(script: Script, configs: Iterable[Mapping[str, object]]) -> dict[str, object]:
     """Return an entry's optional fields: ``summary``, ``main`` (settings to show first), ``asked`` (only if False)."""
     keys = {setting["key"] for setting in configs}
     first = {"summary": script.summary, "main": [key for key in script.main if key in keys]}

@@ -16,13 +16,15 @@ def environment(*more: Mapping[str, str], ours: bool = True) -> dict[str, str]:
 
     For foreign scripts (``ours`` False) ``python3`` is the system's, even if Pebble's comes first in PATH.
     """
-    merged = {"PYTHONUNBUFFERED": "1", **child_environment()}  # else what it prints comes in blocks, long after
+    merged = {"PYTHONUNBUFFERED": "1"}  # else what it prints comes in blocks, long after
+    merged |= child_environment()
     for name in (RUN, CONFIG):  # which run and which robot: only ``more`` says that
         merged.pop(name, None)
     if not ours and sys.prefix != sys.base_prefix and SYSTEM.is_file():
         pebbles = str(Path(sys.prefix, "bin"))
         places = merged.get("PATH", "").split(os.pathsep)
-        merged["PATH"] = os.pathsep.join(sorted(places, key=lambda place: place == pebbles))  # last, as True is 1
+        others = [place for place in places if place != pebbles]
+        merged["PATH"] = os.pathsep.join(others + [place for place in places if place == pebbles])
         merged.pop("VIRTUAL_ENV", None)
     for variables in more:
         merged |= variables

@@ -47,7 +47,7 @@ def facts(config: Config) -> Facts:
 
 
 def _fitness(config: Config, script: Script) -> str:
-    """Return what a script runs with and what that lacks, or why it does not run, in words."""
+    """Return in words what runs the script and which modules are missing there, or why it does not run."""
     if script.broken:
         return f"does not run: {script.broken}"
     if script.ours:  # it uses pebble.script

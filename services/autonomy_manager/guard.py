@@ -47,7 +47,7 @@ class Guard:
             self._descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC, 0o600)
         except OSError as error:
             log.warning("%s cannot be opened: %s", self._path, error.strerror)
-            return
+            return  # scripts run all the same, as where the file system has no locks
         deadline = time.monotonic() + _LOCKED_S
         while not self._try_to_lock():
             if time.monotonic() > deadline:
@@ -87,6 +87,6 @@ class Guard:
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             return False
-        except OSError as error:  # a file system without locks
+        except OSError as error:  # a file system without locks, where scripts run all the same
             log.warning("%s cannot be locked: %s", self._path, error.strerror)
         return True

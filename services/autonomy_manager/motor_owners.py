@@ -52,15 +52,16 @@ class MotorOwners:
         return newest(state.last_barred for state in self._states.values())
 
     def steps_to(self, run: int) -> Iterator[int]:
-        """Yield run numbers whose zeros make every owner treat ``run`` as newer.
+        """Yield run numbers: after a zero with each of them, every owner takes ``run`` for newer than what it bars.
 
-        Needed if a stranger sent numbers far ahead while an owner was away. To that owner ``run`` may seem older,
-        because it is more than half of all numbers behind.
+        Needed if a stranger sent numbers far ahead while an owner was away. If ``run`` is more than half of all numbers
+        ahead of that owner's, it seems older, as numbers begin again after LAST_RUN. A number half-way there does not.
         """
         for barred in [state.last_barred for state in self._states.values()]:
             if not newer(run, barred):
                 ahead = (run - barred) & LAST_RUN
-                yield (barred + ahead // 2) & LAST_RUN or LAST_RUN  # half of the way; 0 is no run
+                half_way = (barred + ahead // 2) & LAST_RUN  # newer than ``barred``, and ``run`` is newer than it
+                yield half_way or LAST_RUN  # 0 is no run
 
     @property
     def refusal(self) -> str:
@@ -79,17 +80,19 @@ class MotorOwners:
     def ending(self, run: int, baseline: Baseline, signs: bool = True) -> str:
         """Return why this run must end; empty if it may continue. New owners are added to ``baseline``.
 
-        ``signs`` False: its script does not sign its commands. Owners take them for a person's and so bar the run at
-        once, which says nothing about people.
+        ``signs`` False: its script does not sign its commands. Owners take them for a person's, and bar the run at
+        once: here a barred run is no reason to end.
         """
         for owner, state in self._states.items():
             boot, count, barred = baseline.setdefault(owner, (state.boot, state.count, 0))
             if state.latched or (state.boot == boot and state.count != count):
                 return _stopped(owner, state)
             # An owner bars all runs up to a number: that before a run that begins, or the newest as a person drives.
+            # The number in ``baseline`` it had barred before this run began.
             is_barred = state.last_barred != barred and not newer(run, state.last_barred)
             if signs and is_barred:
-                newer_began = state.last_barred != run or newer(self.newest_run, run)  # it is barred, or was received
+                # A newer run has begun if one is barred, or a command of one was received.
+                newer_began = state.last_barred != run or newer(self.newest_run, run)
                 return SUPERSEDED if newer_began else OVERRIDDEN
             if state.boot != boot:
                 return f"motor owner {owner} was restarted: start the script again"

@@ -197,6 +197,7 @@ class Runner:
         self._forget_if_ended(run)
 
     def _terminate(self, part: Part) -> None:
+        """Ask a process to end, by SIGTERM; kill it if it has not ended in time."""
         if part.ended:
             return
 

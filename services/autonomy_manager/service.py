@@ -83,6 +83,7 @@ class AutonomyManager(Service):
         self._runner.close(_CLOSE_S)
 
     def on_connected(self) -> None:
+        """Listen, from the first connection on, to who has control; bar the run of an earlier, killed process."""
         if not self._connected_before:
             self._connected_before = True
             self.listen(CONTROL_STATE, self._control)
@@ -123,7 +124,7 @@ class AutonomyManager(Service):
         except StartError as error:
             listing = isinstance(error, UnknownScriptError) and not self._offer.complete
             if listing and self.clock() < until:
-                self._wait(partial(self._start_script, file, config, by, until))
+                self._try_again(partial(self._start_script, file, config, by, until))
                 return
             why = f"{error}: scripts are still being listed, try again" if listing else str(error)
             self.log_limited.log("refused", logging.WARNING, "%s", why)
@@ -131,7 +132,7 @@ class AutonomyManager(Service):
         else:
             self._runner.start(wanted)
 
-    def _wait(self, start: Callable[[], None]) -> None:
+    def _try_again(self, start: Callable[[], None]) -> None:
         """Call ``start`` again soon, unless another command, a person who drives or an emergency stop comes first."""
 
         def again() -> None:
@@ -153,14 +154,15 @@ class AutonomyManager(Service):
 
     @on(ESTOP_STATE)
     def motor_owner(self, state: EstopState, owner: str) -> None:
+        """Handle the state of a motor owner: it may end the run, or show that all stops were reset."""
         self._owners.receive(owner, state)
         if state.latched:
             self._waiting = None
-        run, stopped = self._runner.stoppable, bool(self._owners.refusal)
+        run, stopped = self._runner.stoppable, bool(self._owners.refusal)  # stopped: an owner is latched now
         if run is not None and (why := self._owners.ending(run.number, run.baseline, self._signs)):
             self._runner.stop(why, stopped=stopped)
-        if self._runner.stopped and not stopped:  # it was reset: scripts may start again
-            self._runner.refuse(None)
+        if self._runner.stopped and not stopped:  # its error is a stop, which was reset
+            self._runner.refuse(None)  # scripts may start again
 
     def _control(self, state: ControlState, owner: str) -> None:
         self._owners.receive_control(owner, state)
@@ -196,7 +198,7 @@ class AutonomyManager(Service):
         self.changed()
 
     def _on_person_stops(self) -> None:
-        """End a script that does not sign its commands; refuse starts while the arbiter still refuses scripts."""
+        """End an unsigned script, after a person's final zero; start none while the arbiter refuses scripts."""
         self._refused_until = self.clock() + _HOLD_S
         self._end_unsigned()
 

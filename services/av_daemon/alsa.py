@@ -33,6 +33,7 @@ class AlsaMicrophone(CaptureProgram):
         super().__init__(command)
 
     def grab(self) -> Capture:
+        """Return the next chunk, with the time of its recording; or the newest one, if too many wait."""
         while len(self._buffer) < self._size:
             self._buffer += self.read()
         behind = len(self._buffer) // self._size - 1

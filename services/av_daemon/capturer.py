@@ -25,7 +25,8 @@ class Capturer:
     """A thread that captures until :meth:`end`, which does not wait, because a device can hang.
 
     After :meth:`end` it neither writes nor reports, even if its device answers at last. ``wait_s``: before it opens the
-    device for the first time; ``rest_s``: without a reader, before it closes the device.
+    device for the first time, as in place of a thread that hangs; ``rest_s``: without a reader, before it closes the
+    device.
     """
 
     def __init__(
@@ -42,7 +43,7 @@ class Capturer:
         self._rest_s, self._wait_s = rest_s, wait_s
         self._ended = threading.Event()
         self._source: Source | None = None
-        self._scratch: Bytes = np.empty(0, np.uint8)
+        self._scratch: Bytes = np.empty(0, np.uint8)  # frames are drawn here if shared memory has no room
         self._thread = threading.Thread(target=self._run, name=f"pebble-{name}", daemon=True)
         self._thread.start()
 
@@ -91,6 +92,7 @@ class Capturer:
             source.close()
 
     def _pump(self, source: Source) -> None:
+        """Deliver the frames of an open device, until :meth:`end`, or until there was no reader for ``rest_s``."""
         had_reader_at = time.monotonic()
         while not self._ended.is_set():
             now = time.monotonic()

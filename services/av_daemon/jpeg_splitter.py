@@ -25,7 +25,7 @@ class JpegSplitter:
                 if buffer.endswith(_START[:1]):  # the beginning of a start, perhaps
                     start -= 1
             del buffer[:start]
-            end = _end(buffer)
+            end = _end(buffer)  # 0: not known yet; -1: what begins here is no picture
             if end > 0:
                 pictures.append(bytes(buffer[:end]))
             elif end == 0:  # the rest is still to come

@@ -37,6 +37,7 @@ class LibcameraCamera(CaptureProgram):
 
 
 def _command(options: AvDaemon) -> list[str]:
+    """Return the program with its arguments. Raises DeviceError if none is installed."""
     video = options.video
     program = next((name for name in _PROGRAMS if shutil.which(name)), None)
     if program is None:

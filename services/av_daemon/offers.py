@@ -25,7 +25,7 @@ def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
 def _completed(offer: Any, captured: Any, keys: tuple[str, ...], available: bool, controls: bool) -> Any:
     """Return ``offer``; where it has None for one of ``keys``, it gets the value with which the device captures.
 
-    ``available``: the device is enabled. ``controls``: the bridge is enabled; only with both operators can control it.
+    ``available``: the device is enabled. ``controls``: the bridge is enabled. If both are, operators control it.
     """
     missing = {key: getattr(captured, key) for key in keys if getattr(offer, key) is None}
     return replace(offer, available=available, controls=available and controls, **missing)

@@ -89,7 +89,7 @@ class CameraReader:
                 self._stopping.wait(_RETRY_S)
 
     def _read(self, reader: FrameReader) -> None:
-        """Pass on frames until this was not enabled for ``_LINGER_S``; meanwhile they are dropped."""
+        """Pass on frames while this is enabled. While it is not, drop them; return after ``_LINGER_S`` of that."""
         enabled_at = time.monotonic()
         while not self._stopping.is_set() and time.monotonic() - enabled_at < _LINGER_S:
             frame = reader.read(_POLL_S)

@@ -180,9 +180,9 @@ class LevelControl:
         for memory in (self._seen, self._lost):
             while memory and now - memory[0][0] > _WINDOW_S:
                 memory.popleft()
-        stuck_s = age_s if age_s <= now - self._changed_at else 0.0  # sent since the last change
+        stuck_s = age_s if age_s <= now - self._changed_at else 0.0  # only if sent since the last change
         if stuck_s > _STUCK_S:
-            return self._go_down(max(stuck_s / self._frame_s, self._load), now)
+            return self._go_down(max(stuck_s / self._frame_s, self._load), now)  # the load is at least this frame's
         if now - self._changed_at < _MEASURE_S or not self._seen:
             self._good_since = now
             return False
@@ -223,7 +223,7 @@ class LevelControl:
         if self._rose_at is not None and now - self._rose_at < _PROBATION_S:
             self._patience = min(_LONGEST_PATIENCE_S, max(_PATIENCE_S, 2 * self._patience))
             if load <= 2 * _FULL:
-                affordable = self.step.cost  # only one step down, to where it came from
+                affordable = self.step.cost  # only one step down, to where it came from; above, as far as necessary
         self._rose_at = None
         level = next((level for level in lower if STEPS[level].cost <= affordable), len(STEPS) - 1)
         return self._change(level, now)

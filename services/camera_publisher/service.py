@@ -46,8 +46,8 @@ class CameraPublisher(Service):
         self._sent_size: tuple[int, int] | None = None  # width and height of the last picture
         self._camera_at = now  # when its last frame came
         self._polling = False  # the next call of _poll is planned
-        self._problem = ""  # the last one
-        self._blackness = SourceCheck()
+        self._problem = ""  # why a picture was not sent, or not as requested
+        self._blackness = SourceCheck()  # for how long all pictures are black, see _black
         self._meter, self._keyframes = RateMeter(), KeyframeRequests()
         self._picture_topic = self.addresses[CAMERA].topic
         self._remote = remote_transport(self.config, "camera-publisher")

@@ -39,7 +39,7 @@ def saved(config: Config) -> Path:
 
 
 def programs(config: Config) -> list[Program]:
-    """Return the process, even if Home Assistant was disabled, until the broker has forgotten the robot."""
+    """Return the process; also a disabled one, as long as it may have messages at the broker to remove."""
     bridge = config.services.mqtt_bridge
     runs = config.section(HomeAssistant).enabled or saved(config).exists()
     if not (runs and bridge.enabled and bridge.remote is None):

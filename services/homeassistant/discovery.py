@@ -97,7 +97,8 @@ def _components(
         flag = {"p": "switch", "name": "Video", "stat_t": topic(c.MQTT_VIDEO), "val_tpl": _FLAG}
         yield "video", flag | {"pl_on": "true", "pl_off": "false"} | command(topic(c.MQTT_VIDEO)) | {"ret": not named}
     if section_of(capabilities, "lights").get("solid") is True:
-        unread = dict.fromkeys(("r_tpl", "g_tpl", "b_tpl"), "{{ 0 }}")  # without them Home Assistant offers no colours
+        # Templates for a state that no topic has: without them Home Assistant offers no colours.
+        unread = dict.fromkeys(("r_tpl", "g_tpl", "b_tpl"), "{{ 0 }}")
         light = {"p": "light", "name": "Light", "schema": "template", "cmd_on_tpl": _COLOUR, "cmd_off_tpl": _DARK}
         yield "light", light | unread | command(topic(c.LIGHTS_SOLID))
     for key, (section, channel) in _BUTTONS.items():

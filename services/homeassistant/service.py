@@ -29,7 +29,7 @@ class HomeAssistantService(Service):
         self._remote = remote_transport(self.config, "homeassistant")
         self._place = f"{self._section.prefix}/device/{object_id(self.config.base)}/config"
         self._capabilities: dict[str, Any] = {}
-        self._unit = ""
+        self._unit = ""  # of the battery's level, as the robot publishes it
         self._wanted = self._sent = b""  # the discovery message: as it should be, and as it was sent last
         self._due = False  # it must be sent again, although it has not changed
         self._sent_at = float("-inf")
@@ -99,7 +99,7 @@ class HomeAssistantService(Service):
             return {self._place}
 
     def _save(self, topics: set[str]) -> None:
-        """Save the topics. Without topics the file is removed: this process is then not started next time."""
+        """Save the topics. Without topics the file is removed: a disabled service is then not started next time."""
         if topics == self._retained:
             return
         try:
@@ -109,4 +109,4 @@ class HomeAssistantService(Service):
                 self._file.unlink(missing_ok=True)
         except (OSError, PebbleError) as error:
             self.log.warning("%s: Home Assistant may keep the robot when it is disabled: %s", self._file, error)
-        self._retained = topics
+        self._retained = topics  # even if they are not in the file: this process goes on

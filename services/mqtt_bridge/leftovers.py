@@ -30,7 +30,7 @@ class Leftovers:
         wanted = [state for state in states if state not in (*_EXCEPTED, *channels) and state.synonym_of is None]
         patterns = [state.filter(base) for state in wanted if state.is_pattern]
         named = subjects.topics(*(state for state in wanted if not state.is_pattern))
-        self._filters = [MCU_VALUE.filter(base), *patterns, *named]
+        self._filters = [MCU_VALUE.filter(base), *patterns, *named]  # MCU_VALUE: a manifest may retain it
         self._next = 0  # the index of the filter to ask for next
 
     @property

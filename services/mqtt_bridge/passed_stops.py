@@ -42,7 +42,7 @@ def named(payload: bytes) -> bytes:
 
 
 class Pending(Struct, frozen=True):
-    """A stop that an owner has not confirmed. ``first``: when it was first forwarded; ``at``: since when it waits."""
+    """A stop that an owner has not confirmed. ``first``: when it first came; ``at``: when the copy that waits came."""
 
     stop: EstopCommand
     first: float
@@ -71,7 +71,7 @@ class Owner:
                 self.withdrawn_at = now
             return
         self.withdrawn_at = None
-        # A restart proves no reset: its file may be older than the stop. A greater count: stopped between the states.
+        # Not after a restart: an older file may have freed it. A greater count shows a stop between two states.
         was_stopped = (
             earlier is not None and earlier.boot == state.boot and (earlier.latched or state.count > earlier.count)
         )
@@ -96,9 +96,9 @@ class PassedStops:
         return {key: owner.pending for key, owner in self._owners.items() if owner.pending is not None}
 
     def accept(self, payload: bytes) -> list[bytes]:
-        """Remember a named stop as forwarded, and let owners confirm it; return the payloads to publish.
+        """Remember a named stop as forwarded, and expect owners to confirm it; return the payloads to publish.
 
-        An owner that was reset after the stop was first forwarded gets a copy only if it has yet to confirm the stop.
+        If owners were reset since it first came, and need not confirm it, only the others get it: a copy for each.
         """
         if not is_stop(payload):
             return [payload]
@@ -110,7 +110,7 @@ class PassedStops:
                 del self._passed[next(iter(self._passed))]
             waiting = {key for key, owner in self._owners.items() if _waits(owner, name)}  # owners that may lack it
             reset_since = {key for key, owner in self._owners.items() if owner.freed_at > first} - waiting
-            if reset_since:  # a repetition, pending since it came first: only the other owners get a copy
+            if reset_since:  # this repeats a stop that a reset has ended there: only the other owners get a copy
                 return [_addressed(stop, key) for key in self._owners if key not in reset_since]
             for key, owner in self._owners.items():  # of each owner the newest stop stays pending
                 has_newer = owner.pending is not None and owner.pending.first > first

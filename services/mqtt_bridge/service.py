@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 _PROBE_WAIT_S = 0.1
 _AGAIN_WAIT_S = 1.0  # once a probe has come back: its way may be slow
 _RETRY_S = 1.0
-_IGNORED = (Drop.ECHO, Drop.LATE, Drop.PROBE)  # nothing that a person or a program requests of the bridge now
+_IGNORED = (Drop.ECHO, Drop.LATE, Drop.PROBE)  # dropped messages that are no request, or are too late to be one
 LEFTOVERS_AFTER_S = 30.0  # by then all services have published what they retain; so long after the start, or later
 _LOGGED = 200  # characters of a topic
 _CHECK_STOPS_S = 1.0
@@ -110,7 +110,7 @@ class MqttBridge(ForwardingService):
 
     @property
     def winner(self) -> Side:
-        """Side whose retained messages count: remote; local where names are checked, as operators' do not pass."""
+        """Side whose retained messages count: remote; local at level `named`, where those of operators do not pass."""
         return Side.LOCAL if self.config.security.named else Side.REMOTE
 
     @property
@@ -122,7 +122,7 @@ class MqttBridge(ForwardingService):
     def make_steps(self) -> Mapping[str, Step]:
         return steps_of(self.config)
 
-    def make_names(self) -> Names | None:
+    def make_names(self) -> Names | None:  # the finder of the senders of messages on the remote side
         security = self.config.security
         if not security.named:
             return None
@@ -259,9 +259,9 @@ class MqttBridge(ForwardingService):
             self._open()
         if self.forwarder.gate is Gate.OPEN or not self._same_broker.both_connected:
             return
-        round_ = self._same_broker.begin_round(self.subjects.topics(c.DRIVE)[0])  # which is subscribed to anyway
-        if round_ is not None:
-            wait_s = _PROBE_WAIT_S if self.forwarder.gate is Gate.WAITING else _AGAIN_WAIT_S  # else a probe came back
+        round_ = self._same_broker.begin_round(self.subjects.topics(c.DRIVE)[0])  # for a barrier: subscribed to anyway
+        if round_ is not None:  # else a connection is missing: the next one begins a round
+            wait_s = _PROBE_WAIT_S if self.forwarder.gate is Gate.WAITING else _AGAIN_WAIT_S  # SHUT: a probe came back
             self.call_at(self.clock() + wait_s, partial(self._end_round, round_))
 
     def _end_round(self, round_: int) -> None:
@@ -279,7 +279,7 @@ class MqttBridge(ForwardingService):
             self.forwarder.sides[Side.LOCAL].subscribing()
             self.subscribe_local()
             self.forwarder.subscribed(Side.LOCAL)
-        self.subscribe_remote()
+        self.subscribe_remote()  # only now; the local side is subscribed to while the gate is WAITING
         self.log.info("forwarding between the robot and its remote side")
 
     def found_one_broker(self) -> None:
@@ -354,10 +354,10 @@ class MqttBridge(ForwardingService):
 
     def _follow_control(self, payload: bytes) -> None:
         """Note who has control, and the present key: the time stamp of a command with another key is not judged."""
-        keys = None  # the motor owner gives no keys now
+        keys = None  # no motor owner gives keys: with any key it is judged
         with suppress(PayloadError):
             state: ControlState = codec.decode(c.CONTROL_STATE, payload)
-            keys = frozenset([state.key.encode()]) - {b""}  # empty: no client has control
+            keys = frozenset([state.key.encode()]) - {b""}  # none if no client has control: no stamp is judged
             self._observers.control(state)
         self.forwarder.ages.keys = keys
 
@@ -372,7 +372,7 @@ class MqttBridge(ForwardingService):
         if epoch != self.epoch or self._private.stays(topic):
             return
         if topic == self._stop_topic:
-            if not self._has_passed(message):
+            if not self._has_passed(message):  # by the connection for stops alone
                 self._receive_stop(message)
             return
         self._react(Side.REMOTE, message, self.forwarder.receive(Side.REMOTE, message))
@@ -387,7 +387,10 @@ class MqttBridge(ForwardingService):
 
     def _follow_owner(self, owner: str, payload: bytes) -> None:
         with suppress(PayloadError):
-            self._passed_stops.follow(owner, codec.decode(c.ESTOP_STATE, payload) if payload else None)
+            state = codec.decode(c.ESTOP_STATE, payload) if payload else None
+            self._passed_stops.follow(owner, state)
+            if state is not None:
+                self._observers.estop(owner, state)
 
     def _has_passed(self, message: Message) -> bool:
         """True if the stops' own connection has passed this stop on already. Otherwise remembers it."""
@@ -416,10 +419,10 @@ class MqttBridge(ForwardingService):
             self.refusals.stale("a command" if channel is None else channel.metric)
             return
         if isinstance(routed.outcome, Drop) and (routed.outcome in _IGNORED or not is_local):
-            return  # of what is not forwarded, only requests of the robot's programs count
+            return  # it may still be a request if a program of the robot sent it, and the reason is none of these
         if channel is None or codec.is_blank(message.payload):
             return
-        if not message.retain and routed.outcome is not Drop.KNOWN:  # observers see what is new
+        if not message.retain and routed.outcome is not Drop.KNOWN:  # observers see what is new, not what is known
             # With a closed gate both sides may be one broker, and the message an operator's.
             by_robot = is_local and self.forwarder.gate is Gate.OPEN
             self._observers.passed(channel, ROBOT if by_robot else routed.by, message.payload)

@@ -45,8 +45,8 @@ class _Expected(NamedTuple):
 class Copies:
     """A memory that recognises the second copy of a stop without a name, which comes both ways; thread-safe.
 
-    No stop is lost because of this memory: if the stop connection was dead before that was noticed, :meth:`lost`
-    returns the stops that only the main connection may have received meanwhile.
+    A stop may be taken for the copy of an equal earlier one. It is not lost: if the stop connection was dead before
+    that was noticed, :meth:`lost` returns the stops that only the main connection may have received meanwhile.
     """
 
     def __init__(self, clock: Callable[[], float], notices_s: float) -> None:

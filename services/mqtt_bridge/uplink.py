@@ -40,7 +40,7 @@ class Uplink:
         return seconds
 
     def poll(self) -> bool:
-        """Measure the link and send waiting messages, every POLL_S; return True if a heartbeat may be due, too."""
+        """Measure the link and send waiting messages, every POLL_S; return True to have :meth:`heartbeat_due` asked."""
         return False
 
     def note_drive(self, payload: bytes) -> None:

@@ -72,16 +72,16 @@ class MqttMirror(ForwardingService):
 
     # -- the service's thread
 
-    def connected(self, side: Side, epoch: int) -> None:
+    def connected(self, side: Side, epoch: int) -> None:  # epoch: see ForwardingService
         if side is Side.LOCAL:
             self.forwarder.subscribed(Side.LOCAL)
             self.synchronize_later(Side.LOCAL)
             return
-        if epoch != self.epoch:
+        if epoch != self.epoch:  # that connection is lost already
             return
         if not self.remote.exact_echo:  # then echo=False is not kept to
             self._refuse('sends our own messages back; use one with bridge mode (mosquitto), or protocol "5"')
-        elif self.forwarder.gate is Gate.OPEN:  # checked on an earlier connection; a new probe shows another broker
+        elif self.forwarder.gate is Gate.OPEN:  # the broker was checked; a probe shows if it is another now
             self.subscribe_remote()
             self._request_probe()
         else:
@@ -157,6 +157,7 @@ class MqttMirror(ForwardingService):
         return () if addressed else (payload,)
 
     def receive_local(self, message: Message) -> None:
+        """Forward a message; notice probes of the bridge. Its heartbeats stay here: it alone publishes them."""
         if message.topic not in self._watched:
             self.forwarder.receive(Side.LOCAL, message)
         elif message.topic == self._probe_topic:
@@ -165,7 +166,6 @@ class MqttMirror(ForwardingService):
                 self._announced = True
                 if self._probes.announce(message.payload):  # it came from the broker before: that is the remote one
                     self.shut()
-        # else a heartbeat: only the bridge publishes it; one from the broker is a reason to request a probe
 
     def receive_remote(self, epoch: int, message: Message) -> None:
         if message.topic in self._watched:

@@ -55,8 +55,8 @@ class NeighboursService(Service):
         self._estop = RobotEstop(self.config.base)
         begins = partial(begin, self.config.state_file("neighbour-runs"), self._section.commanded)
         self._visit = Visit(begins, self._number, partial(self.publish, DRIVE), self._local_runs)
-        self._received_at: dict[str, float] = {}
-        self._state: Neighbours | None = None
+        self._received_at: dict[str, float] = {}  # by robot: when its state came last, which shows its presence
+        self._state: Neighbours | None = None  # as published to operators last
 
     def start(self) -> None:
         self._lan.open(timeout=0.0)
@@ -162,7 +162,7 @@ class NeighboursService(Service):
     # -- what a visit needs
 
     def _number(self, barred: int, received: int) -> int | None:
-        """Return the number of a run that begins now; None if a script of this robot runs, or no number is free."""
+        """Return a number here for another robot's run; None if this robot's script runs, or no number can be made."""
         with self._local.none_runs() as free:
             try:
                 return next_run(self.config, barred, received) if free else None

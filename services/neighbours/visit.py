@@ -32,10 +32,10 @@ class Visit:
         self._begin, self._number, self._publish, self._local_runs = begin, number, publish, local_runs
         self._who = ("", 0)  # robot and its run that drive this one, or did so last
         self._sender = DriveSender(0, publish)  # of that run; before the first one it never drives
-        self._states: Mapping[str, EstopState] = {}
+        self._states: Mapping[str, EstopState] = {}  # of this robot's motor owners
         self._received = 0  # the newest number of all commands here
-        self._person_at = float("-inf")
-        self._refused: dict[str, NeighbourRefusal] = {}
+        self._person_at = float("-inf")  # when a person last commanded
+        self._refused: dict[str, NeighbourRefusal] = {}  # by robot: why its run did not begin, or has ended
 
     def command(self, name: str, drive: Drive, now: float) -> bool:
         """Handle a command of a robot that may drive this one; return False if it has no effect."""

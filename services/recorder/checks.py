@@ -43,7 +43,7 @@ def checks(config: Config) -> Iterator[CheckResult]:
 def _running(folder: Path, entries: list[Entry]) -> CheckResult:
     """Check whether the recorder runs, and writes all that it receives."""
     if not Folder.is_in_use(folder):
-        unfinished = sum(entry.is_active for entry in entries)
+        unfinished = sum(entry.is_active for entry in entries)  # of a recorder that was killed
         if unfinished:
             text = f"does not run, and {unfinished} files in {folder} are not finished"
             return warn(text, f"pebble recordings mend {folder}")

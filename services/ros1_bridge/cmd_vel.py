@@ -59,8 +59,8 @@ class CmdVel:
         self._owed = owed  # as stored
         self._has_set_lock = owed  # then a new subscriber of the lock is told its state
         self._heard_at: float | None = None  # when the base last sent odometry
-        self._cancelled_at = float("-inf")
-        self._ends = False
+        self._cancelled_at = float("-inf")  # when the planner's goals were last cancelled
+        self._ends = False  # the thread is to end
         self._due = 0.0  # when the thread sends next; infinite: not before something changes
         self._log = RateLimitedLog(log)
         self.held_back = 0  # moves that a hung base did not get
@@ -82,7 +82,7 @@ class CmdVel:
 
     @property
     def alive(self) -> bool:
-        """True if commands are still repeated."""
+        """True if the thread that repeats commands still runs."""
         return self._thread.is_alive()
 
     @property

@@ -261,7 +261,7 @@ RULES: tuple[Rule, ...] = ((Root, _check),)
 
 
 def programs(config: Config) -> list[Program]:
-    """Return the bridge's program, or none. One that only reads has another name, which is no motor owner's."""
+    """Return the bridge's program; none if disabled. One that does not drive, no motor owner, is ``ros1_reader``."""
     section = config.section(Ros1)
     if not section.enabled:
         return []
@@ -290,6 +290,7 @@ def facts(config: Config) -> Facts:
 
 
 def _facts(section: Ros1) -> Iterator[str]:
+    """Yield the parts of that line: the node, what it drives, and what keeps other programs out after a stop."""
     yield f"node {section.ros.node_name} at {section.master()}"
     if not section.drives:
         yield "reads only"

@@ -146,16 +146,18 @@ def route(body: bytes) -> Route:
 
 
 def goals(body: bytes) -> tuple[Header, list[Goal]]:
+    """Return the goals of a planner, with what has become of each: the message of GOAL_STATUS."""
     reader = _Reader(body)
-    header, goals = reader.header(), []
+    header, results = reader.header(), []
     for _ in range(reader.count()):
         reader.skip(8)  # when the goal was set
         name, (code,), text = reader.text(), reader.get("B"), reader.text()
-        goals.append(Goal(name, code, text))
-    return header, goals
+        results.append(Goal(name, code, text))
+    return header, results
 
 
 def diagnostics(body: bytes) -> tuple[Header, list[Health]]:
+    """Return the header of a DiagnosticArray, and the health of each part that it lists."""
     reader = _Reader(body)
     header, parts = reader.header(), []
     for _ in range(reader.count()):

@@ -52,7 +52,7 @@ class Node:
     """A node of ROS 1. Call :meth:`advertise` and :meth:`subscribe`, then :meth:`start`.
 
     One thread has the sockets, one serves the API of the node, one calls the master and publishers, one calls
-    subscribers that were lost. None of them waits for another, so a call that takes long delays no message.
+    lost subscribers (listed by the master, not connected). None waits for another, so a long call delays no message.
     ``on_evicted(why)`` is called, on some thread, when another node has the name: nothing may move from then on.
     """
 
@@ -70,7 +70,7 @@ class Node:
         #: they were last told again that this node publishes the topic.
         self._missing: dict[tuple[str, str], float] = {}
         self._lost: dict[tuple[str, str], list[str]] = {}  # those to tell now, and the topic's publishers
-        self._is_lost = threading.Event()
+        self._wake_lost = threading.Event()  # wakes the thread that tells lost subscribers
         self._revived = 0  # how often a lost subscriber was told
         self._ends = threading.Event()
         self._threads: list[threading.Thread] = []
@@ -78,7 +78,7 @@ class Node:
         self._jobs: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # of the thread of sockets
         self._greetings: dict[Subscriber, float] = {}  # and when they began
         self._select = selectors.DefaultSelector()
-        self._waker, self._wakes = socket.socketpair()
+        self._waker, self._wakes = socket.socketpair()  # a byte into the first ends the wait for the second, in _select
         self._waker.setblocking(False)
         self._wakes.setblocking(False)
         self._listener = socket.create_server((host, 0), backlog=16)
@@ -109,7 +109,7 @@ class Node:
         for publication in self._publications.values():
             publication.finish()
         self._ends.set()
-        self._is_lost.set()
+        self._wake_lost.set()
         self._wake()
         with suppress(RosError):  # if one call fails, the others wait in vain, too
             for topic in self._publications:
@@ -145,9 +145,9 @@ class Node:
         """Handle another node that has taken this name: move nothing, and wait until it has gone."""
         self.problem = f"the ROS master has ended this node: {why}"
         log.error("%s", self.problem)
-        self._rest()
+        self._stop_publishing()
 
-    def _rest(self) -> None:
+    def _stop_publishing(self) -> None:
         """Stop publishing because another node has this name: disconnect all subscribers, and call ``on_evicted``."""
         self._evicted, self.registered = True, False
         self._on_evicted(self.problem)
@@ -193,12 +193,12 @@ class Node:
                     self._connect_soon(subscription, source)
 
     def _keep_registered(self) -> None:
-        """Register what the master does not know of this node, and tell lost subscribers about it. Raises RosError."""
+        """Register what the master does not know of this node; tell lost subscribers of this node. Raises RosError."""
         publishers, subscribers, _ = call(self.master, "getSystemState", self.name)
         uri = self._uri_of(self.name)
-        if uri not in ("", self.uri) and lives(uri):
+        if uri not in ("", self.uri) and lives(uri):  # "": the master names none
             if not self._evicted:
-                self._rest()
+                self._stop_publishing()
             raise RosError(f"another node is called {self.name}: {uri}")  # to register would end it
         published = {topic for topic, nodes in publishers if self.name in nodes}
         subscribed = {topic for topic, nodes in subscribers if self.name in nodes}
@@ -245,12 +245,12 @@ class Node:
                 missing[topic, node] = now
                 self._lost[topic, node] = publishers.get(topic, [])
         self._missing = missing
-        self._is_lost.set()
+        self._wake_lost.set()
 
     def _run_lost(self) -> None:
         while not self._ends.is_set():
-            self._is_lost.wait()
-            self._is_lost.clear()
+            self._wake_lost.wait()
+            self._wake_lost.clear()
             while self._lost and not self._ends.is_set():
                 topic, node = next(iter(tuple(self._lost)))  # the oldest; a copy, as another thread adds to it
                 publishers = self._lost.pop((topic, node))
@@ -414,6 +414,7 @@ class Node:
             self._connect_soon(subscription, source)
 
     def _read(self, subscription: Subscription, source: Source, sock: socket.socket) -> None:
+        """Take what a publisher has sent: first the answer to our header, then messages. Close a lost connection."""
         try:
             chunk = sock.recv(65_536)
             if not chunk:

@@ -27,11 +27,11 @@ class Subscriber:
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1000 * _UNACKED_S))
-        self.sock, self.name = sock, "?"
+        self.sock, self.name = sock, "?"  # until its request names it
         self.publication: Publication | None = None  # None: it has not said yet what it wants
         self.blocks = Blocks(MOST_HEADER)
         self._unsent = b""  # the end of a block that was sent in part, and has to be completed
-        self._blocked_from: float | None = None
+        self._blocked_from: float | None = None  # since when it takes nothing; None: it has taken the last block
 
     def send(self, data: bytes) -> bool:
         """Send a block at once, or drop it and return False. Raises OSError if the connection is broken."""

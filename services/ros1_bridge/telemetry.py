@@ -47,8 +47,8 @@ class Telemetry:
         self._metrics, self._names, self._publish = section.telemetry, section.ros, publish
         self._counters, self._on_odometry = counters, on_odometry
         self._log = RateLimitedLog(log)
-        self._due: dict[Channel, float] = {}
-        self._goal: dict[str, Any] | None = None
+        self._due: dict[Channel, float] = {}  # when a channel may be published again
+        self._goal: dict[str, Any] | None = None  # the newest one, which the status repeats
         self._navigates_at = float("-inf")  # when a planner was last seen to pursue a goal
         metrics, names = self._metrics, self._names
         battery = metrics.charging_level.enabled or metrics.charging_status.enabled
@@ -109,7 +109,7 @@ class Telemetry:
         read = messages.odometry(body)
         x, y, z = read.position
         yaw = messages.yaw(read.quaternion)
-        _refuse_odd(x, y, z, yaw, read.linear, read.angular)
+        _refuse_infinite(x, y, z, yaw, read.linear, read.angular)
         if wheels:
             value = {
                 "x_mm": round(1000 * x, 3), "y_mm": round(1000 * y, 3), "heading_rad": round(yaw, 6),
@@ -117,6 +117,7 @@ class Telemetry:
                 "angular_speed_radps": round(read.angular, 6),
             }  # fmt: skip
             stamp = _stamp(read.header)
+            # Unlike in what `_tell` publishes, the source is a fixed name, not a topic.
             payload = {"value": value, "unit": "mm", "source": "ros-odometry", "timestamp": stamp}
             self._publish(c.WHEEL_ODOMETRY, payload)
         if pose:
@@ -130,13 +131,14 @@ class Telemetry:
     def _take_goal(self, body: bytes) -> None:
         read: Pose = messages.pose(body)
         yaw = messages.yaw(read.quaternion)
-        _refuse_odd(*read.position, *read.quaternion)
+        _refuse_infinite(*read.position, *read.quaternion)
         turn = {name: round(part, 6) for name, part in zip("xyzw", read.quaternion, strict=True)}
         self._goal = {"frame_id": read.header.frame, **_place(read.position, yaw), "orientation": turn}
         if self._metrics.navigation_goal.enabled:
             self._tell(c.NAVIGATION_GOAL, self._goal, self._names.navigation_goal_topic, read.header)
 
     def _status(self, body: bytes) -> None:
+        """Note whether a planner pursues a goal, and publish the state of that goal, or of the newest, if it is due."""
         header, goals = messages.goals(body)
         newest = goals[-1] if goals else Goal("", -1, "")
         goal = next((goal for goal in goals if goal.code in _ACTIVE), newest)
@@ -151,6 +153,7 @@ class Telemetry:
         self._tell(c.NAVIGATION_STATUS, value, self._names.navigation_status_topic, header)
 
     def _plan(self, channel: Channel, topic: str, metric: LocalPlan, body: bytes) -> None:
+        """Publish a planned path, by at most ``max_points`` of its points, evenly spread."""
         if not self._sampled(channel, metric):
             return
         header, points = messages.route(body)
@@ -158,7 +161,7 @@ class Telemetry:
         step = (len(points) - 1) / (most - 1) if most > 1 else 0.0
         sample = [points[round(number * step)] for number in range(most)]  # with the first and the last
         for point in sample:
-            _refuse_odd(*point)
+            _refuse_infinite(*point)
         shown = [{"x_m": round(x, 6), "y_m": round(y, 6), "z_m": round(z, 6)} for x, y, z in sample]
         value = {
             "frame_id": header.frame, "point_count": len(points), "sampled_point_count": most, "points": shown,
@@ -166,6 +169,7 @@ class Telemetry:
         self._tell(channel, value, topic, header)
 
     def _diagnostics(self, body: bytes) -> None:
+        """Publish the diagnostics as a whole, and the battery that is among them."""
         header, parts = messages.diagnostics(body)
         metrics = self._metrics
         if self._sampled(c.DIAGNOSTICS, metrics.diagnostics):
@@ -183,7 +187,7 @@ class Telemetry:
         level, status = self._metrics.charging_level, self._metrics.charging_status
         if part.name == level.status_name and level.key in part.values:
             number = float(part.values[level.key])
-            _refuse_odd(number)
+            _refuse_infinite(number)
             if self._is_due(c.CHARGING_LEVEL, level, LEVEL_S):
                 payload: dict[str, Any] = {"value": number, "timestamp": stamp}
                 units = [unit for mark, unit in _UNITS.items() if mark in level.key]
@@ -198,6 +202,7 @@ class Telemetry:
                 self._publish(c.CHARGING_STATUS, {"value": charges, "timestamp": stamp})
 
     def _tell(self, channel: Channel, value: dict[str, Any], source: str, header: Header, **more: str) -> None:
+        """Publish ``value`` with the topic ``source`` and the time in the header."""
         self._publish(channel, {"value": value, **more, "source": source, "timestamp": _stamp(header)})
 
 
@@ -227,7 +232,7 @@ def _label(labels: tuple[str, ...], code: int) -> str:
     return labels[code] if 0 <= code < len(labels) else "UNKNOWN"
 
 
-def _refuse_odd(*numbers: float) -> None:
+def _refuse_infinite(*numbers: float) -> None:
     """Raise ValueError for a number that JSON cannot hold: NaN or an infinity."""
     if not all(map(math.isfinite, numbers)):
         raise ValueError("a number is not finite")

@@ -118,7 +118,10 @@ class Answers(Protocol):
 
 
 def serve(node: Answers, host: str, on_refused: Callable[[], object]) -> ApiServer:
-    """Return a server of the API of ``node``, on a free port of ``host``, not yet running."""
+    """Return a server of the API of ``node``, on a free port of ``host``, not yet running.
+
+    Each answer has the form of ROS: 1 (0: it failed), a message for people, and the value.
+    """
     server = ApiServer(host, on_refused)
 
     def publisher_update(_caller: str, topic: str, uris: list[str]) -> list[Any]:

@@ -49,7 +49,7 @@ class SerialService(Service, ABC):
         self._sensor_problem = ""  # as last logged
         self._warned_at = float("-inf")  # of a board that starts again and again
         self._holders: list[str] = []  # other programs at the device
-        self._misread = False  # at the last check
+        self._misread = False  # at the last check bytes had come, and no report was understood
         self._heard = self._heard_opened = 0  # how many reports were understood, and in which opening of the line
         self._reported = Reported(Notifier().mcu)
         self.line = SerialLine(
@@ -115,7 +115,7 @@ class SerialService(Service, ABC):
         return self._heard if self._heard_opened == self.line.opened else 0
 
     def note_start(self) -> None:
-        """Note that the board has started: a restart, if it was heard since the line was opened."""
+        """Note that the board has started; it is a restart if earlier reports came since the line was opened."""
         if self._heard_since_opening() > 1:  # the report of this start is one of them
             self._starts.began(time.monotonic())
 
@@ -131,14 +131,14 @@ class SerialService(Service, ABC):
             return
         idle, heard = now - line.output.sent_until >= CHECK_S, self._heard_since_opening()
         state, silent_ms = self._silence.check(line.state, line.opened, heard, now, idle=idle)
-        # bytes come, and no report in them is understood
+        # Bytes have come since the line was opened, but no report was understood: then ``silent_ms`` is None.
         misread = silent_ms is None and line.state is LineState.READY and line.received > 0
         sensor_problem = self.sensors.problem
         if sensor_problem and not self._sensor_problem:
             self.log.warning("%s", sensor_problem)
         self._sensor_problem = sensor_problem
         starts = self._starts.within_a_minute(line.opened, now)
-        misread_twice = misread and self._misread  # the first time a line may be under way
+        misread_twice = misread and self._misread  # once proves nothing: the first report may be under way
         problem = _MISREAD if misread_twice else line.problem or sensor_problem
         self._misread = misread
         self._reported.report(state, silent_ms, problem, starts)

@@ -52,6 +52,7 @@ class Clips:
         sizes = accumulate(len(name.encode()) for name in clips)  # of the list up to each clip
         listed = len([size for size in sizes if size <= _LONGEST_LIST])
         if listed < len(clips):
+            # A problem that `_files` has met meanwhile counts first.
             self.problem = self.problem or f"only the first {listed} of {len(clips)} are listed"
         return clips[:listed]
 
@@ -74,7 +75,7 @@ class Clips:
             return None
 
     def _clip(self, path: Path | None, name: str) -> Clip | None:
-        """Return the clip at this path in the folder, or None. ``name``: the command's, for a path that is no text."""
+        """Return the clip at this path, or None. It is called ``name`` if its path cannot be written as UTF-8."""
         root = self._folder.resolve()
         if path is None or not path.is_relative_to(root) or path.suffix.lower() not in self._endings:
             return None
@@ -84,10 +85,10 @@ class Clips:
         except OSError:  # too long
             return None
         inside = path.relative_to(root).as_posix()
-        return Clip(inside if is_text(inside) else name, path)  # no text: the command names a link to this file
+        return Clip(inside if is_text(inside) else name, path)  # else the command named a link to it
 
     def _paths(self) -> Iterator[str]:
-        """Yield the paths of the clips among the first _MOST files, as the folder has them."""
+        """Yield the paths of the clips among the first _MOST files, in the folder's order and spelling."""
         return filter(self._is_clip, islice(self._files(self._folder.resolve()), _MOST))
 
     def _files(self, root: Path) -> Iterator[str]:

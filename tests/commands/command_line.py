@@ -42,8 +42,8 @@ def config_file(folder: Path, **changes: Any) -> Path:
 def program(*arguments: str | Path, **options: Any) -> subprocess.Popen[str]:
     """One command line as a process of its own."""
     command = [sys.executable, "-m", "pebble.cli", *map(str, arguments)]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options}
-    return subprocess.Popen(command, cwd=ROOT, text=True, **pipes)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "cwd": ROOT, **options}
+    return subprocess.Popen(command, text=True, **pipes)
 
 
 @contextmanager

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
+from contextlib import ExitStack
 from itertools import product
 from pathlib import Path
 
@@ -16,8 +17,8 @@ import pytest
 
 from pebble.commands import app
 from pebble.extension import ours
-from tests.commands.command_line import Run, config_file
-from tests.support import ROOT, WAIT_S, cases, free_port, some, until
+from tests.commands.command_line import Run, config_file, running
+from tests.support import ROOT, WAIT_S, Broker, cases, free_port, some, until
 
 NAMES = [tuple(words.split()) for words in app.commands(["up"])]
 
@@ -65,6 +66,7 @@ def test_a_command_imports_no_other() -> None:
         (("topic", "list", "--url", "mqtt://127.0.0.1", "--remote"), "--remote", ""),
         (("topic", "echo", "online", "--url", "mqtt://127.0.0.1", "--robot", "a/b"), "--robot a/b", ""),
         (("topic", "list", "--url", "mqtt://127.0.0.1:1"), "127.0.0.1:1", ""),
+        (("topic", "list", "--url", "zenoh:/nowhere"), "`pebble up CONFIG` starts it", ""),
     ],
 )
 def test_what_is_wrong_is_one_line_and_exit_code_1_or_for_a_command_line_2(
@@ -106,6 +108,45 @@ def test_a_robot_runs_without_standard_streams(tmp_path: Path, closed: str) -> N
         assert until(lambda: robot.poll() is not None or children.read_text())
         robot.terminate()
         assert robot.wait(WAIT_S) == 0
+
+
+_AT = ["--url", "URL"]
+#: Commands that run until they are ended. The first of each row prints something once all of them work.
+UNTIL_ENDED = [
+    [["up", "CONFIG"]],
+    [["sim", "goob", "--link", "goob"]],
+    [["web", *_AT, "--port", "0", "--people", "people"]],
+    [["record", *_AT, "--into", "recordings"]],
+    [["foxglove", *_AT, "--port", "0"]],
+    [["exporter", *_AT, "--port", "0"]],
+    [["fleet", "hub", "HUB"]],
+    [["topic", "echo", "a/b", *_AT], ["topic", "pub", "a/b", "{}", "--rate", "10", *_AT]],
+]
+
+
+@pytest.mark.parametrize("commands", UNTIL_ENDED, ids=lambda commands: " ".join(commands[-1][:2]))
+def test_sigterm_is_the_orderly_end_of_a_command_that_runs_until_then(
+    tmp_path: Path, broker: Broker, commands: list[list[str]]
+) -> None:
+    services = {"serial_mcu_bridge": {"enabled": True, "serial": {"port": str(tmp_path / "none")}}}
+    transport = {"kind": "mqtt", "run_dir": str(tmp_path / "run"), "state_dir": str(tmp_path)}
+    config = config_file(tmp_path, transport=transport, services=services, local_mqtt={"port": broker.port})
+    hub = tmp_path / "hub.json"
+    hub.write_text(json.dumps({"listen": [f"tcp/127.0.0.1:{free_port()}"]}))
+    meant = {"URL": f"mqtt://127.0.0.1:{broker.port}", "CONFIG": str(config), "HUB": str(hub)}
+    env = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
+    with ExitStack() as stack:
+        processes = [
+            stack.enter_context(
+                running(*(meant.get(word, word) for word in words), cwd=tmp_path, env=env, stderr=subprocess.STDOUT)
+            )
+            for words in commands
+        ]
+        assert processes[0].stdout is not None
+        printed = processes[0].stdout.readline()
+        for process in processes:
+            process.terminate()
+        assert [process.wait(WAIT_S) for process in processes] == [0] * len(processes), printed
 
 
 def test_a_command_whose_package_is_missing_says_what_to_install() -> None:

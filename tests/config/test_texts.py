@@ -16,7 +16,7 @@ from pebble.config import load, parse
 from pebble.config.hosts import HostError, broker_host, endpoint, name_of_page
 from pebble.config.raw import deep_merge
 from pebble.config.secret_text import without_secrets
-from pebble.config.text_files import NotTextError, text_of
+from pebble.config.text_files import NotTextError, read_password, text_of
 from pebble.config.visible import shown
 from pebble.errors import ConfigError, PebbleError
 from pebble.extensions.fleet.certificates import init
@@ -157,6 +157,11 @@ ENCODED: list[tuple[bytes, str]] = [
     (TEXT.encode() + b"\0", "is not UTF-8 at its byte"),
     (b"\n\xff", "is not UTF-8 at its byte 1, in line 2"),
 ]
+
+
+def test_a_password_is_the_text_of_its_file_without_the_end_of_its_line(tmp_path: Path) -> None:
+    (tmp_path / "password").write_text(f"{SECRET} \n")
+    assert read_password(tmp_path / "password", "--password-file") == f"{SECRET} "
 
 
 def test_a_file_in_another_encoding_is_understood_or_named(tmp_path: Path, run: Run) -> None:

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import signal
+import time
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any, cast
@@ -364,6 +365,15 @@ def test_an_outlet_may_have_any_name_and_there_are_limits() -> None:
     for name in ("Küche 1/power", *(f"{number}/status" for number in range(300))):
         features.receive("a", cast(Feature, notes.decode(notes.encode(Feature(f"outlets/{name}", True)))))
     assert len(features.found) == 256
+
+
+def test_a_launcher_that_is_switched_off_publishes_none(launch: Launch) -> None:
+    robot = launch(("motors", "asker", CONNECTION), enabled=False)
+    assert robot.ready("motors")
+    robot.order("motors", "lacks estop", "lacks nothing")
+    assert until(lambda: "motors wrote what is no note" in robot.stderr())
+    time.sleep(0.3)  # changes so close together are published together
+    assert not robot.published("capabilities")
 
 
 def test_capabilities_are_published_again_when_a_process_reports_and_when_it_ends(launch: Launch) -> None:

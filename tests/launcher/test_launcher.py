@@ -328,7 +328,7 @@ def test_a_robot_has_the_programs_of_its_config(
 
 #: Of a robot with a camera, a text protocol on its serial line, and the security level `open`.
 NEEDED = ["numpy", "pebble.runtime.process", "pebble.extensions.fleet.robot_audit"]
-NOT_NEEDED = ["cv2", "av", "subprocess", "pebble.services.mqtt_bridge.stop_connection"]
+NOT_NEEDED = ["cv2", "av", "subprocess", "pebble.services.mqtt_bridge.stop_connection", "pebble.runtime.hub"]
 
 
 def test_the_launcher_of_a_robot_with_a_camera_imports_only_what_several_share_and_stays_single_threaded() -> None:

@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import signal
+import socket
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -171,6 +172,14 @@ def test_a_launcher_that_gets_little_time_still_ends_what_hangs() -> None:
 def test_the_watchdog_is_served_at_half_its_time(environment: dict[str, str], period_s: float | None) -> None:
     own = {name: text.replace("own", str(os.getpid())) for name, text in environment.items()}
     assert SystemdNotifier(own).watchdog_period_s == period_s
+
+
+def test_systemd_is_told_also_at_an_abstract_address() -> None:
+    name = f"pebble-{os.getpid()}"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(f"\0{name}")
+        SystemdNotifier({"NOTIFY_SOCKET": f"@{name}"}).ready()
+        assert systemd.recv(64) == b"READY=1"
 
 
 @pytest.mark.parametrize("mode", [None, 0o755])

@@ -71,7 +71,8 @@ def test_an_unplugged_board_is_named_everywhere_until_it_is_back(driven: Rig) ->
     driven.mcu.command("unplug")
     why = f"serial: cannot open {driven.mcu.port}"
     assert driven.shows_driveable("no", why)
-    assert f"CANNOT BE DRIVEN OR STOPPED: {why}" in pebble("estop", driven.config, "--remote")
+    assert driven.operator.newest("status")["value"]["mcu"]["serial"]["state"] == "absent"
+    assert f"; nothing confirms that its motors stand: {why}" in pebble("estop", driven.config, "--remote")
     driven.mcu.command("replug")
     assert driven.shows_driveable("yes")
     pebble("estop", "reset", driven.config, "--remote")

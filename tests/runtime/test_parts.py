@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import random
 import re
 import signal
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 from pebble.runtime.bounded_output import KEPT, BoundedOutput
 from pebble.runtime.inbox import Inbox
 from pebble.runtime.lines import LineSplitter
+from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.runtime.source_check import SourceCheck
 from pebble.runtime.timers import Timers
 from pebble.runtime.work_lock import WorkLock
@@ -182,9 +184,20 @@ def test_no_other_thread_enters_before_the_own_one_that_waits() -> None:
 
 
 def test_a_lock_that_is_shut_is_never_entered() -> None:
-    lock = WorkLock()
+    lock, left = WorkLock(), threading.Event()
+    assert lock.try_enter()
+    threading.Timer(0.05, lambda: (left.set(), lock.leave())).start()
     lock.shut()
+    assert left.is_set(), "it waits for the thread that works"
     assert not lock.try_enter()
+
+
+def test_a_subject_of_a_log_makes_room_once_its_period_is_over() -> None:
+    log = RateLimitedLog(logging.getLogger("limited"), period_s=0.01, most=1)
+    for subject in ("old", "new"):
+        log.warning(subject, "an event")
+        time.sleep(0.02)
+    assert log.totals() == {"new": 1}
 
 
 # -- a stream becomes lines: bounded in length and number, none left out unmentioned

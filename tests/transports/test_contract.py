@@ -739,7 +739,7 @@ def test_T14_a_slow_handler_delays_only_itself(net: Net, base: str, caplog: pyte
     release.set()
     assert slow.until(b"0", *wanted[-10:])
     assert client.counters["dropped"] == 89
-    assert "too slow" in caplog.text
+    assert 0 < caplog.text.count("too slow") < 10
 
 
 # -- T15 to T18

@@ -130,12 +130,14 @@ def test_as_published_refuses_to_promise_an_echo(broker: Broker, clients: Client
         clients(broker.port, as_published=True).subscribe(topic, Received())
 
 
+@pytest.mark.parametrize("answer", [b"", b"\x20\2\0\1"], ids=["silently", "unacceptable protocol version"])
 def test_a_broker_that_hangs_up_on_bridge_mode_gets_a_plain_connection_until_it_is_another_one(
-    broker: Broker, clients: Clients, caplog: pytest.LogCaptureFixture, topic: str
+    broker: Broker, clients: Clients, caplog: pytest.LogCaptureFixture, topic: str, answer: bytes
 ) -> None:
     watcher, wills = clients(broker.port), Received()
     watcher.subscribe(topic, wills)
     with BridgelessProxy(broker.port) as proxy:
+        proxy.answer = answer
         bridge = clients(proxy.port, "bridge", as_published=True, will=Message(topic, b"gone"))
         assert not bridge.as_published
         assert "no bridge mode" in caplog.text

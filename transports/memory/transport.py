@@ -95,7 +95,7 @@ class MemoryTransport(Transport):
 
     def __init__(self, client_id: str, settings: MemoryHub, *, will: Message | None = None) -> None:
         super().__init__(client_id, will=will)
-        self._hub = settings
+        self._hub = settings  # all settings of this transport are the hub
         self._inbox: deque[_Delivery] = deque()
         self._changed = threading.Condition(settings.lock)
         self._attached: int | None = None  # the era of the hub we are connected in; None: not connected

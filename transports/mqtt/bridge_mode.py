@@ -39,7 +39,7 @@ class BridgeMode:
             self._note_bridge(result)
 
     def _note_bridge(self, result: Result) -> None:
-        """Note how a CONNECT in bridge mode ended. A hang-up counts after an accepted probe, or if ``_lacking``."""
+        """Note bridge mode's result. A hang-up counts after an accepted probe, or if the mode was missing before."""
         probed, self._probed = self._probed, False
         if result is Result.ACCEPTED:
             self._lacking = False

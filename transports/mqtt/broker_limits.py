@@ -66,7 +66,7 @@ class BrokerLimits:
 
     On 3.1.1 a broker hangs up on a will that is retained or has QoS 1, as mosquitto does, and so does a proxy whose
     broker is away: a hang-up counts only after the same broker has accepted a CONNECT without a will. A client without
-    a will does not learn these limits; such a client withholds the topics on which the broker hangs up.
+    a will cannot learn these limits. Instead it withholds the topics on which the broker hangs up (refused_topics.py).
     """
 
     def __init__(self) -> None:

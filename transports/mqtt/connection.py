@@ -185,7 +185,7 @@ class Connection:
             if owes:
                 with self._lock:
                     client.acknowledge()
-        incoming.age.delay.delivered()
+        incoming.age.delay.delivered()  # even if there were none: what came before a ping's answer is handled now
         if incoming.age.has_retained:  # their handlers may have taken long: the broker was not silent meanwhile
             incoming.age.note_handled()
         if self.in_flight.answered:
@@ -281,7 +281,7 @@ class Connection:
         return _OVERHEAD + len(message.topic.encode()) + len(message.payload) <= self.max_packet
 
     def _is_full(self, message: Message) -> bool:
-        """True if ``message`` is refused beyond UNACKED_LIMIT: all are, except UNACKED_RESERVE more emergency stops."""
+        """True if ``message`` is refused at UNACKED_LIMIT, as all are but the next UNACKED_RESERVE emergency stops."""
         beyond = self.in_flight.unacked - UNACKED_LIMIT
         return beyond >= UNACKED_RESERVE or not self._owner.policy.is_stop(message.topic)
 
@@ -309,11 +309,11 @@ class Connection:
 
         ``asked``: the texts of filters to subscribe to, each of which the broker may refuse; empty to unsubscribe.
         """
-        ack = PendingAck()
+        ack = PendingAck()  # of no packet: if none can be sent, it is completed at once
         with self._lock:
             for at in range(0, len(filters), FILTERS):
                 if self._client.socket is not None:
-                    ack = PendingAck()
+                    ack = PendingAck()  # of this packet
                     self.in_flight.ask(send(filters[at : at + FILTERS]), ack, asked[at : at + FILTERS])
             if not filters or self._client.socket is None:
                 ack.complete()

@@ -82,8 +82,8 @@ class Dialler:
         return connection
 
     def _make(self, will: Message | None, owner: Owner, counters: Counters, *, as_published: bool) -> Connection:
-        assert self._address is not None  # noqa: S101 - both callers run at an address
-        assert self._credentials is not None  # noqa: S101 - and while it is open
+        assert self._address is not None  # noqa: S101 - `begin` has set it
+        assert self._credentials is not None  # noqa: S101 - `open` has set it
         segment = SMALL_SEGMENT if self.loses_large else self._settings.max_segment
         settings = replace(self._settings, password=self._credentials.password(), max_segment=segment)
         self.attempt = Connection(
@@ -105,7 +105,7 @@ class Dialler:
         return self._settings.as_published and self._settings.protocol == "3.1.1"
 
     def _probe(self, owner: Owner, counters: Counters, stopping: threading.Event) -> None:
-        """Connect and disconnect, without bridge mode, and without our will, which a failure would publish."""
+        """Test whether the broker accepts us without bridge mode; leave our will out, as a failure would publish it."""
         probe = self._make(None, owner, counters, as_published=False)
         try:
             probe.connect(stopping)
@@ -121,7 +121,7 @@ class Dialler:
 
     @property
     def _is_last_attempt(self) -> bool:
-        """True unless another attempt has to show whether the broker has bridge mode."""
+        """True if no further attempt at this broker is needed to learn whether it has bridge mode."""
         return not self._asks_for_bridge_mode or self._bridge_mode.next_attempt is Attempt.BRIDGE
 
     def _note_result(self, result: Result) -> None:
@@ -188,12 +188,12 @@ class Dialler:
         ``held_s``: how long a connection lasted, or 0. Return the problem in words ("": none yet), and True to log it.
         """
         addresses, asks_again = self.addresses, self.limits.asks_again
-        if self._is_last_attempt and not asks_again:
+        if self._is_last_attempt and not asks_again:  # this broker will not be asked once more
             why = problem.removeprefix(f"{addresses.where} ")  # the list of failures names the addresses
             failures = addresses.failed(why, held_s)
             if addresses.several:
                 problem = f"broker {addresses.host_port}: {failures}"
-        if asks_again and held_s <= 0:
+        if asks_again and held_s <= 0:  # the next attempt shows what the problem is
             return "", False
         # Of a round through several addresses, only the end is worth a line.
         return problem, held_s > 0 or addresses.is_over or not addresses.several

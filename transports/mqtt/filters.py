@@ -76,7 +76,7 @@ class BrokerFilters:
         return wanted, sorted(merged - {wanted})
 
     def prune(self, unwanted: str, wanted: Sequence[str]) -> list[str]:
-        """Remove and return the subscribed filters that overlap ``unwanted`` and none that is still ``wanted``."""
+        """Remove and return the subscribed filters that overlap ``unwanted``, but overlap no filter in ``wanted``."""
         idle = [
             existing
             for existing in self._subscribed

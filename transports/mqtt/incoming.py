@@ -1,4 +1,4 @@
-"""Reads packets from a broker on one MQTT connection, in batches, and makes messages with an age of them."""
+"""Reads packets from a broker on one MQTT connection, in batches, and makes a message of each PUBLISH, with its age."""
 
 import logging
 from collections.abc import Mapping
@@ -77,8 +77,8 @@ class Incoming:
         """Raise Silent if the broker has not answered for too long."""
         if self.accepted is None:
             return  # `connect` has its own deadline, and gives the first round trip
-        silence_s = now - max(self.answered_at, self.age.arriving_at)
-        if silence_s > self.silence_s and silence_s > (limit := self.pings.silence_limit_s):  # at least self.silence_s
+        silent_s = now - max(self.answered_at, self.age.arriving_at)
+        if silent_s > self.silence_s and silent_s > (limit := self.pings.silence_limit_s):  # never less; slower to get
             self._counters.add("silences")
             raise Silent(f"{self.where} has not answered for {limit:.1f} s")
 
@@ -120,7 +120,7 @@ class Incoming:
         if self.reason:
             client.close()
         self.more = bytes_left > 0 or not client.drained
-        if self.more:  # else our own `read` notes that the socket is empty
+        if self.more:  # else `Incoming.read` notes that the socket is empty
             self.age.waiting.read(unread - bytes_left)
         return unread - bytes_left
 
@@ -128,10 +128,10 @@ class Incoming:
         """Read once from the socket; return the number of bytes, from which the ages of messages are estimated."""
         age, waiting = self.age, self.age.waiting  # waiting: since when bytes may have been in the socket
         age.received_at = now
-        if now - waiting.checked_at > OVERSLEPT_S and self.accepted is not None:
+        if now - waiting.checked_at > OVERSLEPT_S and self.accepted is not None:  # no pings before the CONNACK
             self.pings.send_after_stall(client, now)
         size = client.receive()
-        waiting.found(size if client.drained else size + readable_bytes(client.socket), now)
+        waiting.found(size if client.drained else size + readable_bytes(client.socket), now)  # with what is left
         return size
 
     @property
@@ -226,7 +226,7 @@ class Incoming:
         qos = QoS.DELIVERED if first & ANY_QOS else QoS.LATEST
         self.messages.append(Message(text, payload, qos, retain, retain_requested, age.since))
 
-    def skips(self, topic: bytes) -> bool:
+    def skips(self, topic: bytes) -> bool:  # if so it counts the packet, which `on_publication` never gets
         if self.messages:
             return False  # what came before may change the answer
         try:

@@ -48,8 +48,8 @@ class Backlog:
     def __init__(self) -> None:
         self.waiting: dict[str | int, Message] = {}  # retained ones by topic, the others by number
         self._numbers = itertools.count()
-        self._live_bytes = 0
-        self._live = 0
+        self._live_bytes = 0  # of the messages that are not retained,
+        self._live = 0  # and how many these are
 
     def __bool__(self) -> bool:
         return bool(self.waiting)
@@ -162,7 +162,7 @@ class InFlightTable:
 
     @property
     def waiting_since(self) -> float | None:
-        """Time since when messages of QoS 1 wait and none was acknowledged; None if none waits."""
+        """Time of sending the oldest message without PUBACK or, if later, of the newest PUBACK; None if none waits."""
         if not self._unacked:
             return None
         _, oldest_sent_at = next(iter(self._unacked.values()))
@@ -186,7 +186,7 @@ class InFlightTable:
         if message.qos is QoS.DELIVERED:
             self._unacked[mid] = (message.topic, now)
         if message.retain:
-            entry = self._unconfirmed[message.topic]
+            entry = self._unconfirmed[message.topic]  # made by `accept`
             if message.qos is QoS.DELIVERED:
                 entry.mid = mid
             else:
@@ -207,9 +207,9 @@ class InFlightTable:
         return self._unacked[mid][0] if mid in self._unacked else None
 
     def first_written(self, now: float) -> dict[str, int]:
-        """Return by topic the size of the largest recent message that is the first of its topic, or of its size there.
+        """Return by topic the size of the largest recent message that may be why the broker closed the connection.
 
-        Because of these the broker may have closed the connection: it has accepted all before an answered ping.
+        It has accepted all before an answered ping: so only the first on a topic, or the first so large, may be it.
         """
         sizes: dict[str, int] = {}
         for written in [*(ping.written for ping in self._pings), self._written]:
@@ -270,7 +270,7 @@ class InFlightTable:
 
     @property
     def round_trip_s(self) -> float:
-        """The shortest recent round trip. By a longer one, of a delayed answer, a stall would be noticed too late."""
+        """The shortest recent round trip: a longer one includes a delay, and would let a stall be noticed too late."""
         return min(self._round_trips, default=0.0)
 
     def newest_answer(self, now: float) -> tuple[int, float]:

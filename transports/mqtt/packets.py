@@ -298,8 +298,8 @@ class Reader:
         if self._modern and payload_at < stop and data[payload_at] < 128:  # then properties, whose length is one byte
             payload_at += 1 + data[payload_at]
         elif self._modern and payload_at <= stop:
-            size, length = _read_variable(data[payload_at : min(payload_at + 4, stop)], 0)
-            payload_at = stop + 1 if size < 0 else payload_at + length + size
+            size, size_bytes = _read_variable(data[payload_at : min(payload_at + 4, stop)], 0)
+            payload_at = stop + 1 if size < 0 else payload_at + size_bytes + size  # stop + 1: refused below
         if payload_at > stop or not topic:
             raise MalformedError("a message that ends in its head" if topic else "a message without a topic")
         if not (first & RETAIN and payload_at < stop and self._listener.skips(topic)):
@@ -331,7 +331,7 @@ class Reader:
         if body[1]:
             self._listener.on_refused(body[1])
             return
-        values = properties(body[2 : 2 + self._properties_size(body)])
+        values = properties(body[2 : 2 + self._properties_size(body)])  # by their numbers; below in Accepted's order
         accepted = Accepted(*map(values.get, (_MAXIMUM_PACKET, _RECEIVE_MAXIMUM, _MAXIMUM_QOS, _RETAIN_AVAILABLE)))
         if accepted.receive_maximum is not None:
             self._quota.begin(accepted.receive_maximum)

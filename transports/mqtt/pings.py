@@ -25,7 +25,7 @@ class Pings:
         self._interval_s = max(_LEAST_S, min(settings.silence_s, keepalive_s) / 4)
         self._thin_interval_s = min(_THIN_INTERVAL_S, keepalive_s / 2)
         self.is_thin = False  # see `Transport.is_thin`
-        self.due_at = inf  # once accepted they are sent regularly: other answers come only to what we publish
+        self.due_at = inf  # until `begin`; then regularly, as without pings only what we publish is answered
         #: Since when nothing had been read when :meth:`send_after_stall` sent its last ping: one for each stall.
         self._stalled_since = age.waiting.checked_at
 

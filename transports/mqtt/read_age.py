@@ -72,7 +72,7 @@ class BrokerDelay:
         self._newest = 0.0  # seconds that the newest answer took; 0: it tells nothing
         self._came_at = 0.0  # when something was received last
         self._stall = 0.0  # seconds for which the broker stood still; messages count as having waited so long
-        self._until = 0.0  # until this time
+        self._until = 0.0  # until this time they count so
         self._prompt = 0  # answers in a row that came right after the newest of several pings
 
     def usual(self, seconds: float) -> None:
@@ -84,7 +84,7 @@ class BrokerDelay:
         self._pings.append(_Ping(now, now, clear))
 
     def stalled(self, since: float, now: float) -> None:
-        """Note that a ping was sent, and nothing read since ``since``: messages may have waited at the broker."""
+        """Note a ping after a pause in our own reading, from ``since`` on: messages may have waited at the broker."""
         self._pings.append(_Ping(since, now, clear=True))
 
     def answered(self, now: float) -> None:
@@ -115,7 +115,7 @@ class BrokerDelay:
         self._delivered_answer = self._read_answer
 
     def delivery(self, now: float) -> tuple[float, float]:
-        """Return the age of the newest ping whose answer came before the last delivery, and how late answers are."""
+        """Return the age of the newest ping answered before :meth:`delivered` was called, and how late answers are."""
         sent_at, took = self._delivered_answer
         waits = now - self._pings[0].sent_at if self._pings else 0.0
         return now - sent_at, max(took, waits) - self._shortest
@@ -134,16 +134,16 @@ class BrokerDelay:
         """
         since = sent_at = now
         for ping in self._pings:
-            if ping.clear:  # of those that tell anything, the oldest
+            if ping.clear:  # the oldest one that no other data of ours held up
                 since, sent_at = ping.since, ping.sent_at
                 break
-        if self._came_at <= sent_at and now - sent_at > self._shortest + _NOTICED_S:  # nothing came: it stood still
+        if self._came_at <= sent_at and now - sent_at > self._shortest + _NOTICED_S:  # nothing came since the ping
             self._stall, self._until = now - sent_at, now + _BACKLOG_S
         self._came_at = now
-        waited = max(self._newest, now - since, self._stall if now < self._until else 0.0)
+        waited = max(self._newest, now - since, self._stall if now < self._until else 0.0)  # the cases above
         if waited <= self._shortest + _NOTICED_S:
             return 0.0
-        # TCP's present round trip, within bounds: at least the usual one, at most so much longer.
+        # TCP's present round trip, but no less than the usual one, and at most _UPLINK_S more than that.
         way_s = max(self._shortest, min(round_trip_s(), self._shortest + _UPLINK_S))
         return waited - way_s
 

@@ -47,10 +47,10 @@ class RefusedTopics:
     def __init__(self, client_id: str, vital: tuple[str, ...]) -> None:
         self._client_id, self._vital = client_id, vital
         self._losses: dict[str, int] = {}  # in a row, by topic
-        self.withheld: dict[str, Withheld] = {}
+        self.withheld: dict[str, Withheld] = {}  # by topic: what is not sent, as the broker hangs up
         self._trial: Trial | None = None
         self._quiet_at = -inf  # a trial begins after this time, which is QUIET_S after the newest loss
-        #: Topics on which the broker takes no messages: why, and when that was last in the log.
+        #: Topics that were logged as refused, withheld or not: why, and when that was last in the log.
         self.not_taken = BoundedTable[tuple[str, float]](TOPICS, TOPICS * MAX_BYTES, lambda _: 0)
 
     def accepts(self, message: Message) -> bool:
@@ -85,11 +85,11 @@ class RefusedTopics:
                 return
 
     def note_loss(self, where: str, written: Mapping[str, int] | None, now: float) -> None:
-        """Note a lost connection. ``written``: by topic, sizes of messages that may be why; None if none can be."""
+        """Note a lost connection. ``written``: by topic, the size of a message that may be why; None: no message is."""
         written, trial, self._trial = written or {}, self._trial, None
         self._quiet_at = now + QUIET_S
         ordinary = [topic for topic in written if not self._is_vital(topic)]  # those that may be withheld at any size
-        if trial is not None and ordinary == [trial.topic]:
+        if trial is not None and ordinary == [trial.topic]:  # of those only it was written
             self._blame(where, trial.topic, written[trial.topic], now)
             return
         self._losses = {topic: self._losses.get(topic, 0) + 1 for topic in written}

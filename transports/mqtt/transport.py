@@ -125,7 +125,7 @@ class MqttTransport(Transport):
 
     def _send(self, message: Message, urgent: bool) -> bool:
         connection = self._connection
-        if connection is None or not (self._state is State.CONNECTED or self._own.syncing):
+        if connection is None or not (self._state is State.CONNECTED or self._own.syncing):  # see `_initial_sync`
             return False
         if not connection.takes(message):
             why = f"{len(message.payload)} bytes, but it takes packets of {connection.max_packet} at most"
@@ -135,7 +135,7 @@ class MqttTransport(Transport):
         if self._refused.withheld and not self._refused.admits(message, time.monotonic()):
             self.counters.add("withheld")
             return True  # here, too
-        expires_s = ceil(self.settings.silence_s) if urgent and not message.retain else None
+        expires_s = ceil(self.settings.silence_s) if urgent and not message.retain else None  # later it is stale
         if message.retain:
             self._own_message_filter.note_own(message)
         return connection.publish(message, expires_s=expires_s)
@@ -157,22 +157,22 @@ class MqttTransport(Transport):
                 return  # the next connection subscribes to them
             # Retained messages come after the SUBACK, on a bad network long after it; a ping's answer follows them.
             acks.append(connection.ping())
-        if self._network is None or threading.current_thread() is not self._network.thread:  # it reads the answers
+        if self._network is None or threading.current_thread() is not self._network.thread:  # the reader of the answers
             deadline = time.monotonic() + _ANSWER_S
             for ack in acks:
                 ack.wait(deadline - time.monotonic())
 
-    def ask(self, topics: Collection[str]) -> None:
+    def ask(self, topics: Collection[str]) -> None:  # by an exact subscription to each, until the answer has come
         deadline = time.monotonic() + _ANSWER_S
         with self._filters.lock:
-            connection, names = self._connection, [topic for topic in topics if topic not in self._filters]
-            if connection is None or not names:
+            connection, unheard = self._connection, [topic for topic in topics if topic not in self._filters]
+            if connection is None or not unheard:
                 return
-            for name in names:
-                self._own_message_filter.subscribe_again(name)
-            # Retained messages come after the SUBACK; the ping's answer follows them.
-            answer = connection.subscribe([(name, self._no_local(name)) for name in names], QoS.LATEST)
-            acks = [answer, connection.ping(), connection.unsubscribe(names)]
+            for topic in unheard:
+                self._own_message_filter.subscribe_again(topic)
+            # Retained messages come after the SUBACK, to all subscriptions that match; the ping's answer follows them.
+            answer = connection.subscribe([(topic, self._no_local(topic)) for topic in unheard], QoS.LATEST)
+            acks = [answer, connection.ping(), connection.unsubscribe(unheard)]
         for ack in acks:
             ack.wait(deadline - time.monotonic())
 
@@ -206,10 +206,10 @@ class MqttTransport(Transport):
             if stopping.is_set():
                 return
             held_s = time.monotonic() - began if self._state is State.CONNECTED else 0.0
-            problem, logged = self._dialler.failed(problem, held_s)
+            problem, is_to_be_logged = self._dialler.failed(problem, held_s)
             if problem:
                 self.problem = problem
-            if logged:
+            if is_to_be_logged:
                 self._log(logging.WARNING, problem)
             if held_s > _STEADY_S:
                 failures = 0
@@ -250,14 +250,14 @@ class MqttTransport(Transport):
             self._keep_unconfirmed(connection)
 
     def _serve(self, connection: Connection, run: _Run) -> None:
-        tried_at = time.monotonic() + _TRIED_S  # a connection that ends before that shows no limits
+        tried_at = time.monotonic() + _TRIED_S  # if the connection ends before that, it shows no limits
         try:
             self._synchronize(connection, run.stopping)
             if earlier_failures := self._dialler.addresses.succeeded():
                 self._log(logging.INFO, f"connected to {connection.where}; before it {earlier_failures}")
             while not run.stopping.is_set():
                 connection.pump(_IDLE_S, self._deliver_all)
-                if run.renewal:
+                if run.renewal:  # see renew_connection
                     connection.disconnect()
                     raise Lost(run.renewal)
                 if connection.limits is not self._dialler.reported and time.monotonic() > tried_at:
@@ -291,9 +291,9 @@ class MqttTransport(Transport):
 
     def _synchronize(self, connection: Connection, stopping: threading.Event) -> None:
         """Ask which of our retained messages the broker has, subscribe, and send those that it lacks."""
-        self._renew()
+        self._renew()  # all subscriptions: retained messages are delivered again
         self._own_message_filter.begin()
-        if self._dialler.stalled:
+        if self._dialler.stalled:  # the broker may have been suspended
             self._let_catch_up(connection, stopping)
         known_topics = self._query_own(connection, stopping)
         with self._filters.lock:
@@ -312,7 +312,7 @@ class MqttTransport(Transport):
         self._dialler.stalled = False
 
     def _query_own(self, connection: Connection, stopping: threading.Event) -> set[str]:
-        """Return the topics of our retained messages that the broker has, so that they need not be sent again.
+        """Return the topics of our retained messages that are not sent again: the broker has ours, or rightly another.
 
         Sets ``went_back`` if it has another value on a topic that only we publish on: an older one. All values have
         arrived when a ping is answered, because they have QoS 0.
@@ -328,14 +328,14 @@ class MqttTransport(Transport):
         differing = {topic for topic, payload in retained.items() if payload != messages[topic].payload}
         older = differing - may_differ
         self.went_back = bool(older)
-        return retained.keys() - older  # with those that may differ: there ours is not sent again
+        return retained.keys() - older  # an older one is replaced by ours
 
     def _find(self, connection: Connection, topics: list[str], stopping: threading.Event) -> dict[str, bytes]:
         """Return the payloads that the broker retains on these topics."""
         retained: dict[str, bytes] = {}
         if not topics:
             return retained
-        connection.subscribe([(topic, False) for topic in topics], QoS.LATEST)
+        connection.subscribe([(topic, False) for topic in topics], QoS.LATEST)  # False: no noLocal, as they are ours
 
         def note(messages: list[Message]) -> None:
             for message in messages:
@@ -390,7 +390,7 @@ class MqttTransport(Transport):
         subscriptions = list(self._subscriptions)
         for filter_, is_refused in refused.items():
             for subscription in subscriptions:
-                if overlap(subscription.filter, filter_):  # the filter that covers it: no other one overlaps
+                if overlap(subscription.filter, filter_):  # no filter of the broker does but the one that covers it
                     subscription.refused = is_refused
 
     def note_refusal(self, topic: str, why: str) -> None:

@@ -60,8 +60,8 @@ class Guard:
         self._warned = False
         self._wakeup, self._lock = Wakeup(), threading.Lock()
         self._thread: threading.Thread | None = None
-        self._calls: list[Calls] = []
-        self._sessions: list[zenoh.Session] = []
+        self._calls: list[Calls] = []  # of the threads that run callbacks
+        self._sessions: list[zenoh.Session] = []  # by which threads are given something to do
 
     def use(self, session: zenoh.Session) -> None:
         """Remember a session, through which a thread can be given work. Any session does: all share Zenoh's threads."""
@@ -124,8 +124,8 @@ class Guard:
         """Give another of Zenoh's threads something to do: the task that Zenoh starts for a query's time limit."""
         self.helped += 1
         with self._lock:
-            sessions = self._sessions[::-1]
-        for session in sessions:
+            sessions = self._sessions[::-1]  # a copy, the newest first
+        for session in sessions:  # one that works is enough: all share Zenoh's threads
             try:  # the query does not leave the session
                 session.get(_NOTHING, _nothing, timeout=_HELP_S, allowed_destination=zenoh.Locality.SESSION_LOCAL)
             except Exception:  # closed meanwhile; whatever it is, the guard goes on
@@ -157,7 +157,7 @@ def direct(function: Callable[[Any], None], at_end: Callable[[], None] | None = 
 
     def run(received: Any) -> None:
         calls = _local.calls if hasattr(_local, "calls") else _begin()
-        calls.begun += 1
+        calls.begun += 1  # until `ended` is as great, the guard sees a callback that runs
         try:
             if guard.rests:
                 guard.wake()

@@ -99,7 +99,7 @@ class HubConnection:
             answered.wait(max(0.0, end - time.monotonic()))
 
     def _query(self, session: zenoh.Session, subscription: Subscription, counts: dict[str, int]) -> threading.Event:
-        """Ask for the retained messages of one subscription; return an event that is set at the end of the answer."""
+        """Ask for one subscription's retained messages, see :meth:`fetch`; return an event set at the answer's end."""
         connection, answered = self._connection, threading.Event()
 
         def take(reply: zenoh.Reply) -> None:

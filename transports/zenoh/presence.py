@@ -81,7 +81,7 @@ class HubWatch:
                 self._lost_sessions[session] = None
             elif session in self._lost_sessions:
                 del self._lost_sessions[session]
-                self._change(hubs=self._view.hubs)
+                self._change(hubs=self._view.hubs)  # the same hubs, but a new version
 
     def _change(self, hubs: frozenset[str], appeared: int = 0) -> None:
         self._view = HubView(self._view.version + 1, self._view.connection + appeared, hubs)
@@ -123,7 +123,7 @@ class Barrier:
                 log.warning("%s did not answer within %.1f s and will not be waited for again", names, timeout)
                 self._silent |= missing.keys()
                 break
-            if not self._ask(set(missing), answers, remaining_s):
+            if not self._ask(set(missing), answers, remaining_s):  # not all have answered
                 time.sleep(pause)
                 pause = min(2 * pause, longest)
         self._silent -= set(answers)

@@ -69,7 +69,7 @@ def session_config(
 ) -> str:
     """Return the configuration of a ``mode`` (router, peer or client), on unix sockets and the settings' endpoints.
 
-    ``rules``: of a hub, what certificates allow, instead of the settings' ``allowed_names``. Raises TransportError for
+    ``rules``: what a hub permits to each certificate, in place of ``settings.allowed_names``. Raises TransportError for
     endpoints or certificates that can never work.
     """
     for name, endpoints in (("listen", settings.listen), ("connect", settings.connect)):

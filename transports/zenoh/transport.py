@@ -81,7 +81,7 @@ class ZenohTransport(Transport):
         self._thread = threading.Thread(target=self._run, name=f"pebble-zenoh {self.client_id}", daemon=True)
         self._thread.start()
         sessions.close_at_exit(self)
-        self._opened.wait(min(timeout, OPEN_SYNC_S))
+        self._opened.wait(min(timeout, OPEN_SYNC_S))  # for the siblings; the caller waits for the hub
 
     def _start_peer(self) -> None:
         presence = self._presence = self._siblings.register(self.client_id)
@@ -93,7 +93,7 @@ class ZenohTransport(Transport):
         except (zenoh.ZError, TransportError) as error:
             presence.release()
             raise TransportError(f"zenoh session of {self.client_id}: {error}") from None
-        if self._begin(session, presence.name):
+        if self._begin(session, presence.name):  # False: closed meanwhile
             presence.ready()
 
     def _start_client(self) -> bool:
@@ -133,7 +133,7 @@ class ZenohTransport(Transport):
         self._hub.watch.close()
         with self._hub.lock:
             session = self._session
-        if session is not None and self._pid == os.getpid():
+        if session is not None and self._pid == os.getpid():  # a fork cannot use the session
             self._publish_will_and_leave(session, will)
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(OPEN_SYNC_S + HUB_ANSWER_S)
@@ -160,7 +160,7 @@ class ZenohTransport(Transport):
     def _run(self) -> None:
         if self.settings.client and not self._start_client():
             return
-        version = 0  # of the newest view that was handled
+        version = 0  # of the newest HubView (which hubs are present) that was handled
         linked = 0  # the number of the hub connection that works; 0: none does, and with a hub it is tried again
         self._wait_for_siblings_once()
         watch = self._hub.watch  # of this run: it is closed at the end, and replaced when the transport opens again
@@ -223,7 +223,7 @@ class ZenohTransport(Transport):
             return False
         self._refresh()
         self._set_state(State.CONNECTED)
-        self._send_lacking(session, set())  # what became pending meanwhile
+        self._send_lacking(session, set())  # only what became pending meanwhile: the hub lacks nothing else
         return True
 
     def _send_hello(self, session: zenoh.Session) -> bool:
@@ -249,7 +249,7 @@ class ZenohTransport(Transport):
         with self._publishing:
             owed = bool(self._own.pending or lacking)
             self._sync_retained(self._own.keys() - lacking)  # sends all but these
-            self._hub.put_removals(session, lacking)  # it may lack removals, too
+            self._hub.put_removals(session, lacking)  # or it may lack their removals
             return owed
 
     def _refresh(self) -> None:
@@ -258,8 +258,8 @@ class ZenohTransport(Transport):
             if self._session is None:
                 return
             with self._hub.lock:
-                self._hub.renew()
-                self._renew()
+                self._hub.renew()  # answers to earlier queries are dropped
+                self._renew()  # all subscriptions: retained messages are delivered again
             counts = self._synchronize(SYNC_S)  # after _renew: messages received live meanwhile are newer
             self._hub.fetch(self._session, list(self._subscribers), counts)
 

@@ -1,6 +1,6 @@
 """The protocol between a robot's Zenoh sessions, apart from payloads: keys, stamps and queries to the hub.
 
-A live message carries its quality, whether it was published with retain, and when it was sent. A retained message is
+A live message carries its QoS, whether it was published with retain, and when it was sent. A retained message is
 sent under ``@retain/`` with the name of the session that wrote it, and how many such messages it had sent by then.
 ``@`` chunks match no wildcard, so no ordinary subscription receives these.
 """
@@ -45,7 +45,7 @@ _FIRST: _Treatment = {"priority": zenoh.Priority.REAL_TIME}
 _WAIT: _Treatment = {"congestion_control": zenoh.CongestionControl.BLOCK}
 _DROP: _Treatment = {"congestion_control": zenoh.CongestionControl.DROP}
 BLOCK = {**_DATA, **_WAIT}
-TREATMENTS = {  # by quality and urgency
+TREATMENTS = {  # by QoS and urgency
     (QoS.DELIVERED, False): BLOCK,
     (QoS.DELIVERED, True): {**_FIRST, **_WAIT},
     (QoS.LATEST, False): {**_DATA, **_DROP},
@@ -54,7 +54,7 @@ TREATMENTS = {  # by quality and urgency
 
 _QUALITIES = (QoS.LATEST, QoS.DELIVERED)
 
-_LIVE = struct.Struct(">BIQ")  # quality and retain, boot, ns since it
+_LIVE = struct.Struct(">BIQ")  # QoS and retain, boot, ns since it
 _RETAINED = struct.Struct(">BQ")
 
 BOOT = crc32(Path("/proc/sys/kernel/random/boot_id").read_bytes())  # shared by all containers of a machine
@@ -65,7 +65,7 @@ since_boot_ns: Callable[[], int] = partial(time.clock_gettime_ns, time.CLOCK_BOO
 
 
 class LiveStamp(msgspec.Struct, frozen=True):
-    """The attachment of a live message; ``sent_ns`` counts since ``boot``. Both are 0 if the message has none."""
+    """The attachment of a live message; ``sent_ns`` counts since ``boot``. Both are 0 if it has no attachment."""
 
     qos: QoS
     retain_requested: bool | None

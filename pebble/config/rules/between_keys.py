@@ -18,13 +18,13 @@ from pebble.contract.identity import GATEWAYS, SERVERS
 from pebble.errors import PebbleError
 from pebble.ownership import read_for
 
-#: Words in commands of the original's configs, and why they do harm, or nothing, here.
+#: Words in commands of the original Pebble's configs, each with why it does harm, or nothing, here.
 _WORDS_OF_ORIGINAL = (
     (re.compile(r"\bpebble-control\b").search, "starts the original, too, at the same serial port"),
     (re.compile(r"(?:^|[\s/])(?:sudo|doas|pkexec)\b").search, "needs a right that our unit denies"),
     (re.compile(r"\bgit\b.*\b(?:pull|fetch|merge|reset)\b").search, "updates Pebble only if it runs from that folder"),
 )
-#: The commands to write for our unit, by section.
+#: The commands to write instead, by section, for our unit of systemd.
 _COMMANDS_OF_UNIT = {
     "reboot_control": "systemctl --no-ask-password reboot",
     "service_restart_control": "systemctl --no-block restart pebble.service",
@@ -40,7 +40,7 @@ def _root(reader: Reader, root: Root, _path: Path) -> Root:
     kind, platform = root.transport.kind, root.robot.platform
     if root.transport.mqtt_mirror is not None and kind != "zenoh":
         why = f'only a Zenoh robot has a mirror and kind is "{kind}": leave it out'
-        reader.notes.doubt(("transport", "mqtt_mirror"), why)
+        reader.notes.doubt(("transport", "mqtt_mirror"), why)  # a problem, unless a noted one may be its cause
     if root.robot.type in (SERVERS, GATEWAYS):
         reader.notes.problem(("robot", "type"), f'must not be "{root.robot.type}": those are no robots')
     if platform != "linux" and kind != "mqtt":
@@ -77,7 +77,7 @@ def _transport(reader: Reader, transport: TransportSection, path: Path) -> Trans
 
 def _bridge(reader: Reader, bridge: MqttBridge, path: Path) -> MqttBridge:
     notes, remote, link = reader.notes, bridge.remote, bridge.link
-    for section, command_of_unit in _COMMANDS_OF_UNIT.items():
+    for section, command_of_unit in _COMMANDS_OF_UNIT.items():  # what to write for our unit of systemd
         words = " ".join(getattr(bridge, section).command)
         reasons = [reason for occurs_in, reason in _WORDS_OF_ORIGINAL if occurs_in(words)]
         if bridge.enabled and reasons:

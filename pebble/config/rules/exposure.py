@@ -51,7 +51,7 @@ def brokers(root: Root) -> Iterator[tuple[Path, Mqtt]]:
 def connections(root: Root) -> Iterator[tuple[Path, Section]]:
     """Yield all sections of connections in use, those of extensions included, with their places in the config."""
     yield from core_connections(root)
-    for place, holder in (("services",), root.services), ((), root):
+    for place, holder in {("services",): root.services, (): root}.items():
         for name in holder.__struct_fields__:
             section = getattr(holder, name)
             if isinstance(section, Section):

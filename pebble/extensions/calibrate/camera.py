@@ -41,7 +41,12 @@ def view_of(tag: Tag, size: tuple[int, int]) -> View | None:
         return None
     x, y = tag.corners.mean(axis=0)
     near, between, far = _DISTANCES
-    distance = near if share >= _NEAR else between if share >= _MIDDLE else far
+    if share >= _NEAR:
+        distance = near
+    elif share >= _MIDDLE:
+        distance = between
+    else:
+        distance = far
     return _ROWS[int(3 * y / height)], _COLUMNS[int(3 * x / width)], distance
 
 
@@ -50,7 +55,7 @@ def collect(
 ) -> tuple[list[Floats], tuple[int, int]]:
     """Return the corners of the tag in up to 27 different places, and the width and height of the pictures.
 
-    ``still``: every picture counts. Otherwise the tag must be at rest, and 15 well-spread places are enough.
+    ``still``: photos, which all count. In a stream the tag must be at rest, and 15 well-spread places are enough.
     """
     by_view: dict[View, Floats] = {}
     size, resting = (0, 0), 0  # resting: pictures in a row in which the tag rests

@@ -82,7 +82,10 @@ def fit(runs: Sequence[Run], noise: Noise, step_mm: tuple[float, float], track_m
 
 
 def _equations(runs: Sequence[Run], noise: Noise, wheels: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the residuals of the equations, divided by their noise, and their derivatives by the three lengths."""
+    """Return the residuals of the equations, and the derivatives of the expected values by the three lengths.
+
+    Both are divided by the noise.
+    """
     left_mm, right_mm, track = wheels
     differences, slopes = [], []
     for run in runs:

@@ -50,9 +50,9 @@ class Legs:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._robot, self._expected, self._mm_s, self._clock = robot, expected, mm_s, clock
-        self._finder: TagFinder | None = None
+        self._finder: TagFinder | None = None  # None: no tag is watched
         self._tag_id = 0
-        self._picture: Any = None
+        self._picture: Any = None  # the newest one that was looked at
         self._odometry = Odometry(expected, clock())
         #: Messages from the handlers' threads, with their times; :meth:`_wait` handles them on the thread that drives.
         self._inputs: queue.SimpleQueue[tuple[Callable[..., None], Any, float]] = queue.SimpleQueue()
@@ -138,9 +138,9 @@ class Legs:
         ends: Callable[[Counts], bool],
         late: str = "is it slower than --speed says?",
     ) -> Counts:
-        """Drive until ``ends`` is true for the counts since the start, and the wheels stand; return the counts.
+        """Drive until ``ends`` is true for the counts since the start. Return the counts once the wheels stand.
 
-        ``late``: the reason in the error if that takes too long.
+        ``late``: the reason in the error if ``ends`` is not true in time.
         """
         robot, start = self._robot, self._counts()
         until = self._clock() + MOST * expected_s + 0.5  # motors take a moment to their speed
@@ -181,7 +181,7 @@ class Legs:
         return place is not None and abs(place.angle_rad - start.angle_rad) < _AT_TAG_RAD
 
     def _sight(self, max_age: float = 0.3) -> Place | None:
-        """Return the place of the tag in a picture of the last ``max_age`` seconds; None if it is in none."""
+        """Return the tag's place in a new picture, at most ``max_age`` seconds old; None without a picture or tag."""
         assert self._finder is not None  # noqa: S101 - only a calibration with a tag looks
         self._wait(0.01)
         last_picture, self._picture = self._picture, self._robot.picture(max_age)

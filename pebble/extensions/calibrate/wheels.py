@@ -142,6 +142,7 @@ class _Session:
     # -- the two kinds
 
     def _straight(self, number: str, sign: int) -> Run:
+        """Drive a straight; return the wheels' steps and the true movement, as the tag shows or the person types."""
         name = f"{number}, straight {'there' if sign > 0 else 'back'}"
         wanted, mm = self._wanted, sign * self._wanted.length_m * 1000
         if wanted.truth == "tag":
@@ -161,6 +162,7 @@ class _Session:
         return Run(name, counts.left, counts.right, moved.turn_rad, moved.mm)
 
     def _spin(self, number: str, sign: int) -> Run:
+        """Drive a spin; return the wheels' steps and the true turn, by the tag, the gyroscope or the person."""
         name = f"{number}, spin {'left' if sign > 0 else 'right'}"
         wanted, turns = self._wanted, sign * self._wanted.turns
         start = self._legs.look() if wanted.truth == "tag" else None
@@ -192,7 +194,7 @@ class _Session:
         if self._wanted.truth == "tape":
             what += " and mm to the left of it (right: minus), such as 1497 -12"
             along, aside = self._numbers(what, 2, is_plausible)
-            return arc(sign * along, aside)
+            return arc(sign * along, aside)  # without the sign: left of the heading, also when it drives back
         half_turn = self._gyro(counts) / 2  # the direction of an arc's end, from the first heading
         (along,) = self._numbers(what, 1, is_plausible)
         return arc(sign * along, sign * along * math.tan(half_turn))

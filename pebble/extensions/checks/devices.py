@@ -26,8 +26,8 @@ def device(path: Path, what: str, key: str, names: Path) -> CheckResult:
     such as by-id/.
     """
     if not path.exists():
-        links = [link for link in names.glob("by-id/*") if not _METADATA.search(link.name)]
-        fix = f"ls -l {names / 'by-id'}/" if len(links) != 1 else f"set {key} to {links[0]}"
+        links = sorted(str(link) for link in names.glob("by-id/*") if not _METADATA.search(link.name))
+        fix = f"set {key} to {' or '.join(links)}" if links else f"plug it in, then: ls {names}/by-id/*; and set {key}"
         return failed(f"{path} does not exist: is {what} plugged in?", fix)
     if not os.access(path, os.R_OK | os.W_OK):
         fix = f"sudo usermod -aG $(stat -c %G {path}) $USER, then log in again"
@@ -60,6 +60,7 @@ def cameras(config: Config, folder: Path = Path("/dev")) -> Iterator[CheckResult
 
 
 def camera(backend: str, name: str, folder: Path) -> CheckResult:
+    """Check the camera that the config calls ``name``. ``folder``: where device files are."""
     if backend == "synthetic":
         return ok("synthetic: needs no device")
     if backend != "v4l2":
@@ -88,7 +89,7 @@ def loudspeaker(config: Config) -> Iterator[CheckResult]:
     commands = []
     if sounds.enabled:
         commands.append(sounds.playback.player_command)
-    if devices.enabled and devices.audio.enabled:
+    if devices.enabled and devices.audio.enabled:  # as for the program that plays voices, see loudspeaker_programs
         commands.append(config.section(Media).audio_receiver.command)
     for name in dict.fromkeys(command[0] for command in commands):
         if shutil.which(name) is not None:

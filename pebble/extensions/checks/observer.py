@@ -48,7 +48,7 @@ class Observer:
         self.listeners: list[Callable[[Message, float], None]] = []  # get each message, and when it arrived (monotonic)
         #: Returns each change of the wheels' speeds as seen from outside: when (monotonic), and left and right.
         self.eyes: Callable[[], list[tuple[float, list[float]]]] = list  # nothing is seen from outside
-        self._of: defaultdict[c.Channel | None, deque[Record]] = defaultdict(lambda: deque(maxlen=_MOST))
+        self._of: defaultdict[c.Channel | None, deque[Record]] = defaultdict(lambda: deque(maxlen=_MOST))  # by channel
         self._slowest_s = ANSWER_S / 4  # of its answers so far, at least this; :attr:`patience_s` follows from it
         self._arrived: deque[tuple[Message, float, float]] = deque(maxlen=_MOST)  # with the times, monotonic and epoch
         # If the robot checks names, its commands have this client's account in their topics.
@@ -124,13 +124,13 @@ class Observer:
     # -- what is sent
 
     def send(self, channel: c.Channel, value: object) -> float:
-        """Publish a command, as bytes or as its struct; return the time (monotonic)."""
+        """Publish a command, as bytes or as its struct; return the time of sending (monotonic)."""
         payload = value if isinstance(value, bytes) else codec.encode(channel, value)
         self.transport.publish(channel.topic(self.base), payload, qos=QoS(channel.default_qos), urgent=True)
         return time.monotonic()
 
     def sent(self, seconds: float) -> float:
-        """Wait until the broker has acknowledged all commands, at most ``seconds``; return the time (monotonic)."""
+        """Wait up to ``seconds`` until the broker has acknowledged all commands; return the time then (monotonic)."""
         self.wait(lambda: self.transport.outgoing.waiting == 0, seconds)
         return time.monotonic()
 
@@ -151,9 +151,9 @@ class Observer:
 
     @contextmanager
     def beside(self, program: str, *filters: str) -> Iterator[tuple[Transport, deque[Message]]]:
-        """Yield a second connection that reads ``filters``.
+        """Yield a second connection that reads ``filters``, and its messages. ``program``: as in :class:`Target`.
 
-        Each filter is a subscription of its own, as some brokers refuse one of them.
+        Each filter is a subscription of its own, as some brokers refuse one filter and grant the others.
         """
         messages: deque[Message] = deque(maxlen=_MOST)
         with connected(replace(self.target, program=program)) as (beside, _):

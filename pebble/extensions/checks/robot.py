@@ -53,7 +53,7 @@ def who_drives(config: Config) -> Iterator[CheckResult]:
     """Report the security level, and which accounts may drive the robot at that level."""
     level = config.security.level
     if warning := warning_of_open(config):
-        yield warn(warning, "pebble fleet init, then the account of this robot")
+        yield warn(warning, f"pebble fleet init FOLDER --host NAME; pebble fleet add {config.robot.id} --role robot")
         return
     yield ok(f"level {level}: it is driven by {_DRIVERS[level]}")
     folder = _fleet_folder(config) if level != "open" else None
@@ -100,8 +100,8 @@ def state_directory(path: Path) -> CheckResult:
 
 
 def config_of_running(config: Config) -> Iterator[CheckResult]:
-    """Check that no file of the config has changed since the robot was started with it."""
-    lock = config.run_dir() / LAUNCHER_LOCK
+    """Check that the config file has not changed since the robot was started with it."""
+    lock = config.run_dir() / LAUNCHER_LOCK  # which the launcher writes at its start
     if config.path is None or not launcher_runs(config.run_dir()):
         return
     if config.path.stat().st_mtime > lock.stat().st_mtime:
@@ -124,7 +124,7 @@ def operator_page(config: Config) -> Iterator[CheckResult]:
         yield failed(str(error))  # which says what to do
         return
     if settings.login and settings.certificate is None:
-        yield warn("is not encrypted: passwords can be read", "pebble cert init")
+        yield warn("is not encrypted: passwords can be read", "pebble cert init NAME")
     else:
         yield ok(f"port {settings.port} of {settings.host}")
     if settings.certificate is None:
@@ -132,7 +132,7 @@ def operator_page(config: Config) -> Iterator[CheckResult]:
     try:
         days = certificates.show(settings.certificate).days_left
     except certificates.CertificateError as error:
-        yield failed(str(error), "pebble cert init")
+        yield failed(str(error), "pebble cert init NAME")
         return
     text = f"its certificate ends in {days:.0f} days"
     yield ok(text) if days >= SOON_DAYS else warn(text, "pebble cert renew")

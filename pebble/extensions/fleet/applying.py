@@ -112,7 +112,7 @@ def pid_of(folder: Path) -> int | None:
         pid = int(read_plain(folder / PID))
     except (OSError, ValueError):
         return None
-    with as_before():  # only root sees the processes of other users
+    with as_before():  # as root again, if inside of as_owner: only root sees all processes
         return pid if _is_broker(pid) else None
 
 

@@ -64,7 +64,7 @@ class Audit:
         fields = zip(_FIELDS, (ref, user, device, address, detail), strict=True)
         texts = {field: text[:_MAX_TEXT].encode(errors="replace").decode() for field, text in fields}
         refused = what in REFUSED
-        like = (what, network_of(address)) if refused else None  # one row for a network, whatever names it tries
+        like = (what, network_of(address)) if refused else None  # refusals of one network share a row
         most = OF_STRANGERS if refused or what in MILD else DIFFERENT  # different rows a minute, see RowWriter.add
         self._writer.add({"t": time.time(), "what": what, **texts}, like, most)
 
@@ -120,5 +120,5 @@ def _take_over(database: sqlite3.Connection) -> None:
     if list(database.execute("PRAGMA table_info(refused)")):
         database.execute(f"INSERT INTO audit ({_COLUMNS}) SELECT {_COLUMNS} FROM refused")  # noqa: S608
         database.execute("DROP TABLE refused")
-    database.execute("DROP TABLE IF EXISTS marks")
+    database.execute("DROP TABLE IF EXISTS marks")  # what it noted of robots' own audits
     database.execute("COMMIT")

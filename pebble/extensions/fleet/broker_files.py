@@ -95,7 +95,10 @@ def passwords_in(text: str) -> dict[str, Hashed]:
 
 
 def rules_in(acl: str) -> Iterator[str]:
-    """Yield rules as ``ACCOUNT: RULE``; the account is ``everybody`` for a rule before the first account."""
+    """Yield rules as ``ACCOUNT: RULE``; the account is ``everybody`` for a rule before the first account.
+
+    The word ``topic``, with which :func:`acl_text` begins each rule, is left out; any other first word stays.
+    """
     name = "everybody"
     for line in filter(None, map(str.strip, acl.splitlines())):
         word, _, rest = line.partition(" ")

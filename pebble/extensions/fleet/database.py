@@ -104,7 +104,7 @@ class Database:
 
 
 def _connection(path: Path | None, tables: str) -> sqlite3.Connection:
-    """Open the file and create missing tables. Raises OSError and sqlite3.Error."""
+    """Open the file, which exists already, and create missing tables. Raises OSError and sqlite3.Error."""
     if path is not None:
         if path.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))

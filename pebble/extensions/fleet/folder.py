@@ -39,7 +39,7 @@ class Server(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit
     """The place where a broker of the fleet listens. ``unencrypted``: a port for boards without TLS.
 
     ``included``: it is the mosquitto of its machine, which includes `mosquitto.conf` in its own configuration. Programs
-    of that machine reach it at ``PLAIN_PORT`` of loopback, where TLS would keep out a robot whose clock is not set.
+    there reach it at ``PLAIN_PORT`` of loopback, without TLS, which would keep out a robot whose clock is not set.
     """
 
     host: str
@@ -126,7 +126,8 @@ def refused(fleet: Fleet, name: str, account: Account) -> str:
         return why
     is_gateway = any(role in account.roles for role in (ProgramRole.GATEWAY, ProgramRole.BOARDS))
     is_robot = any(role in account.roles for role in (ProgramRole.ROBOT, ProgramRole.NEIGHBOUR))
-    if not is_gateway and len(account.bases) != (1 if is_robot else 0):
+    bases_needed = 1 if is_robot else 0
+    if not is_gateway and len(account.bases) != bases_needed:
         return "a robot, or a neighbour, has one base (--base pebble/robots/goob), and no other account has any"
     if account.plain and not is_robot:
         return "only a robot can be plain"
@@ -135,8 +136,8 @@ def refused(fleet: Fleet, name: str, account: Account) -> str:
     for base in account.bases:
         if why := _refused_base(base, may_be_filter=is_gateway):
             return why
-        for owner, other in fleet.accounts.items() if is_robot else ():
-            if base in other.bases and other.roles == account.roles:
+        for owner, other in fleet.accounts.items():
+            if is_robot and base in other.bases and other.roles == account.roles:
                 return f"{base} belongs to {owner}"
     return ""
 

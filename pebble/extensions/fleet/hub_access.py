@@ -91,7 +91,8 @@ def access_control(rows: Iterable[tuple[Sequence[str], Iterable[Grant]]]) -> dic
     rules: dict[Grant, dict[str, Any]] = {}
     subjects: list[Mapping[str, Any]] = []
     policies: list[dict[str, Any]] = []
-    for subject, grants in [(LOCAL, EVERYTHING), *((_named(names), grants) for names, grants in rows if names)]:
+    accounts = [(_named(names), grants) for names, grants in rows if names]
+    for subject, grants in [(LOCAL, EVERYTHING), *accounts]:
         granted = [rules.setdefault(grant, _rule(f"r{len(rules)}", grant)) for grant in grants if grant.keys]
         subjects.append(subject)
         policies.append({"rules": [rule["id"] for rule in granted], "subjects": [subject["id"]]})
@@ -105,7 +106,7 @@ def access_control(rows: Iterable[tuple[Sequence[str], Iterable[Grant]]]) -> dic
 
 
 def priorities(commands: Sequence[str], stops: Sequence[str]) -> dict[str, Any]:
-    """Return Zenoh's setting ``qos`` for messages from other machines; ``stops`` are among ``commands``, all are keys.
+    """Return Zenoh's setting ``qos`` for messages from other machines, by Zenoh's keys; ``commands`` include ``stops``.
 
     Only ``stops`` get the first priority, and only they wait for a slow receiver; other commands are dropped. Otherwise
     the sender would choose: commands with the first priority would delay stops, and messages that wait would make the
@@ -160,7 +161,7 @@ class AccountAdmission(Admission):
         return not account or session.startswith(account + wire.OF)
 
     def _allowed_will(self, account: str, rules: HubAccount, will: wire.Will | None) -> wire.Will | None:
-        """Return a client's will as one of its account; None if there is none, or the account may not leave it."""
+        """Return a client's will, named after its account; None if it has none, or if the account may not leave it."""
         if will is None:
             return None
         will = replace(will, client=f"{account}{wire.OF}{will.client}")  # so it replaces no other account's will

@@ -64,8 +64,8 @@ class CheckedNames(Names):
     def sign(self, sender: Sender, message: Message) -> Signed | Drop:
         """Return ``message`` with its sender in the payload, or why it is refused. Called for each message.
 
-        A ``by`` in the payload is only a claim: behind an account it names the person, from a stranger it is removed. A
-        stop needs no account; its claim stays, with a mark.
+        A ``by`` in the payload is only a claim. If the sender has an account, the claim is added to it, as the person's
+        name; if not, it is removed. A stop needs no account; its claim stays, with a mark.
         """
         subject, account, payload = sender.subject, sender.account, message.payload
         channel = None if subject is None else subject.channel
@@ -76,12 +76,12 @@ class CheckedNames(Names):
             if channel is None or not (channel.suffix in self._strangers or _is_zero(channel, payload)):
                 return Drop.UNNAMED  # a drive command that only stops passes without a right
         elif (message.retain or message.retain_requested) and payload_type is not EstopCommand:
-            return Drop.STALE
+            return Drop.STALE  # a flag, too: with a name it is a command
         if channel is GROUP and not _is_group(payload):  # several commands in one payload
             return Drop.UNREADABLE
         fields, by = _object(payload), account  # by: the checked sender, in place of a claim
         if fields is not None:
-            body = _body(fields)
+            body = _body(fields)  # the same object, or its ``value``
             claim = body.get("by")
             if account != NO_ACCOUNT and isinstance(claim, str) and claim:
                 by = _with_person(account, claim[:_LONGEST])
@@ -105,7 +105,7 @@ def _doubted(payload: bytes) -> bytes:
     claim = body.get("by")
     if not isinstance(claim, str) or not claim:
         return payload
-    body["by"] = unchecked(claim)
+    body["by"] = unchecked(claim)  # in ``fields``, of which ``body`` is a part
     return _encoder.encode(fields)
 
 
@@ -131,10 +131,10 @@ def _is_group(payload: bytes) -> bool:
 
 
 def _object(payload: bytes) -> dict[str, Any] | None:
-    """Return the JSON object in ``payload`` as every reader of the contract parses it; None if they cannot."""
+    """Return the JSON object in ``payload`` as every reader of the contract parses it; None if there is none."""
     try:
         usual = payload[:1] == b"{" and payload[-1:] == b"}" and len(payload) <= _USUAL_BYTES
-        if usual and payload.isascii() and b"\0" not in payload:  # the fast way to the same result
+        if usual and payload.isascii() and b"\0" not in payload:  # the fast way to the same result; a NUL ends the JSON
             fields = _decoder.decode(payload)
         else:
             fields = codec.plain(DRIVE, payload)  # reads the JSON of any channel

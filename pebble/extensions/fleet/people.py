@@ -283,7 +283,7 @@ def _spellings(password: str) -> set[str]:
 
 @cache
 def _no_hash() -> bytes:
-    return _hash("", b"no such person..")
+    return _hash("", b"no such person..")  # with the salt that :meth:`People.check` takes for an unknown name
 
 
 def _hash(password: str, salt: bytes) -> bytes:

@@ -32,7 +32,7 @@ from pebble.contract import (
     codec,
 )
 from pebble.contract.names import NO_ACCOUNT
-from pebble.contract.payloads import ControlState, EstopCommand, LightsSolid, Switch
+from pebble.contract.payloads import ControlState, EstopCommand, EstopState, LightsSolid, Switch
 from pebble.errors import PayloadError
 from pebble.extensions.fleet.row_writer import DIFFERENT, OF_STRANGERS, WINDOW_S, Row, RowWriter
 from pebble.forwarding.observer import ROBOT, Observer
@@ -44,7 +44,7 @@ from pebble.version import __version__
 _UNCHECKED = "?"  # behind a name that the broker has not checked
 _MOST_BYTES = 8_000_000  # of each of two files
 _NAME, _FILE = 40, 64  # characters
-_STOPS = 256  # names of stops that are remembered: a stop is repeated until it is confirmed; and senders of lights
+_REMEMBERED = 256  # names of stops, as a stop is repeated until it is confirmed; and as many senders of lights
 _REFUSED = {
     *(Drop.UNNAMED, Drop.MISNAMED, Drop.UNREADABLE, Drop.SIGNED, Drop.LATE),
     *(Drop.STALE, Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN),
@@ -78,7 +78,9 @@ class Audit(Observer):
         self._level = config.security.level
         self._writer, self._clock = RowWriter(self._append, clock), clock
         self._holder: ControlState | None = None  # None: not known yet
-        self._stops = deque[tuple[str, str]](maxlen=_STOPS)  # those that have a row: name and sender
+        self._owners, self._awaited = config.motor_owners, set[str]()  # those that have not answered the newest reset
+        self._refusals = dict[str, str | None]()  # by owner: why it has refused its last reset, if it has
+        self._stops = deque[tuple[str, str]](maxlen=_REMEMBERED)  # those that have a row: name and sender
         self._lights = dict[tuple[str, bool], float]()  # when each sender last sent lights, on or off
 
     def start(self) -> None:
@@ -102,14 +104,16 @@ class Audit(Observer):
                     self.passed(member.channel, by, member.payload)
         row_of = _COMMANDS.get(channel.suffix)
         if row_of is None and channel.kind not in (Kind.FLAG, Kind.ACTION):
-            return
+            return  # a group, too: only its members have rows
         with suppress(PayloadError):
             if row_of is not None:
                 command = codec.decode(channel, payload)
                 row, who = row_of(command), _sender(by, command)
-                most_different = OF_STRANGERS if channel in _MILD else DIFFERENT  # in a minute
+                most_different = OF_STRANGERS if channel in _MILD else DIFFERENT  # in a minute, see RowWriter.add
                 if row and not self._noted_before(row, who):
                     self.note(who=who, most=most_different, **_place(by), **row)
+                if channel is ESTOP_RESET:
+                    self._awaited.update(self._owners)
             else:
                 on = bool(payload) and bool(codec.decode(channel, payload))
                 if on or channel.kind is Kind.FLAG:  # an action that is not "on" does nothing
@@ -133,19 +137,29 @@ class Audit(Observer):
                 who = holder.by if holder.named and holder.by else f"{holder.by}{_UNCHECKED}"
                 self.note(what, who, id=holder.id, device=holder.device)
 
+    def estop(self, owner: str, state: EstopState) -> None:
+        """Add a row if the owner has refused a reset; its state shows only why it has refused the last one."""
+        why, before = state.reset_refused, self._refusals.get(owner, state.reset_refused)
+        is_answer = owner in self._awaited
+        is_of_another = why == "boot" and len(self._owners) > 1  # a reset is for one owner's boot: all others refuse it
+        self._refusals[owner] = why
+        self._awaited.discard(owner)
+        if why and (is_answer or why != before) and not is_of_another:
+            self.note("reset-refused", owner=owner, why=why)
+
     def unconfirmed(self, owner: str, stop: EstopCommand) -> None:
         self.note("stop-not-confirmed", owner=owner, stop=str(stop.stop))
 
     def _noted_before(self, row: Row, who: str) -> bool:
-        """True if the log tells this of the sender already: the stop has a row, or the lights have blinked like this.
+        """True if the sender has a row for the same stop, or has switched lights so (on or off) in the last minute.
 
-        If not, remember it. A stop may arrive with its sender's account, and once more without: each has a row. Lights
-        that blink have one row on and one off, until they rest for a minute.
+        Remembers the row. A stop may arrive with its sender's account, and once more without: then it has two rows.
+        Lights that blink have one row for on and one for off, and new ones only after they have rested for a minute.
         """
         if row["what"] == "lights":
             key, now = (who, row["on"]), self._clock()
             last_at = self._lights.pop(key, -math.inf)
-            if len(self._lights) >= _STOPS:
+            if len(self._lights) >= _REMEMBERED:
                 self._lights.pop(next(iter(self._lights)))  # the one that rests longest
             self._lights[key] = now
             return now - last_at < WINDOW_S

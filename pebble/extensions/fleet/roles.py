@@ -199,7 +199,7 @@ def rules(
 
 
 def metrics(right: Right, extra: Extra | None = None) -> tuple[str, ...]:
-    """Return the metrics below ``incoming/`` that the right may write, as parts of filters."""
+    """Return the metrics below ``incoming/`` that the right may write, with ``+`` for each placeholder ``{name}``."""
     declared = (channel if isinstance(channel, str) else channel.metric for channel in WRITES.get(right, ()))
     return (*(re.sub(r"{[^}]*}", "+", metric) for metric in declared), *getattr(extra, right, ()))
 
@@ -279,7 +279,7 @@ def _of_expander() -> Iterator[Rule]:
     for channel in c.CHANNELS:
         if channel.kind is Kind.STREAM and channel.remote and channel.bridged and channel is not c.STREAMS:
             yield Rule("write", channel.filter(_ANY))
-    # How groups are written, the groups, and announcements of expanders, also those with a name: only one may work.
+    # How groups are written, the groups, and announcements with and without a name, by which only one expander works.
     for suffix in (c.WIRE.suffix, c.STREAMS.suffix, c.EXPANDER.suffix, f"{INCOMING}/{BY}/+/{c.EXPANDER.metric}"):
         yield Rule("read", f"{_ANY}/{suffix}")
     yield Rule("read", f"{c.SHORT}+")  # the short topics of groups

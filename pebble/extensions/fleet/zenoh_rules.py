@@ -46,7 +46,7 @@ def _hub_account(account: Account, held: Iterable[Rule]) -> HubAccount:
     writes = [rule.filter for rule in held if rule.access == "write"]
     is_robot = ProgramRole.ROBOT in account.roles
     wills = [f"{base}/{OUTGOING}/#" for base in account.bases if is_robot]
-    all_topics = [filter_ for filter_ in writes if is_robot and filter_.endswith("/#")]
+    all_topics = [filter_ for filter_ in writes if is_robot and filter_.endswith("/#")]  # so do all of a robot's rules
     flags = [filter_ for filter_ in writes if filter_.endswith(_FLAGS)]
     return HubAccount(tuple(wills), tuple(dict.fromkeys((*wills, *all_topics, *flags))))
 
@@ -60,7 +60,7 @@ def _grants(name: str, held: Sequence[Rule], retains: Iterable[str], *, is_hub: 
     # What ``wire`` adds to messages: the client's hello and goodbye, retained messages and their numbers, running hubs.
     greetings = tuple(wire.asked(kind, name) for kind in (wire.HELLO, wire.BYE))
     retained, retained_counts, running_hubs = _retained(reads), (f"{wire.SYNC}*",), (f"{wire.UP}*",)
-    yield Grant(OUT, ("put",), reads)
+    yield Grant(OUT, ("put",), reads)  # OUT: from the hub to the client
     yield Grant(IN, ("declare_subscriber",), reads)
     yield Grant(IN, ("put",), (*writes, *_retained(_keys(retains))))
     # Zenoh lets a declaration out only if a rule covers its whole key; programs on the hub's machine may declare any.

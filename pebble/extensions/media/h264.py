@@ -58,8 +58,8 @@ class H264Encoder:
         except ValueError:  # UnknownCodecError
             raise PebbleError("h264: this PyAV was built without libx264") from None
         self._context: av.VideoCodecContext | None = None
-        self._opened_for: tuple[object, ...] = ()
-        self._count = 0
+        self._opened_for: tuple[object, ...] = ()  # the arguments of _open for this context
+        self._count = 0  # pictures so far: the time stamp of the next one
         self._i420: Pixels | None = None  # the last picture as the codec takes it; cv2 writes the next one into it
         self._reduced: Pixels | None = None  # the picture with which others are compared
         self._resting = 0  # pictures that have not differed from it

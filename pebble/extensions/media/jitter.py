@@ -176,7 +176,7 @@ class JitterBuffer:
             return None
         if now < self._due:
             return None
-        if now - self._due > _DELAY_LIMIT_S:
+        if now - self._due > _DELAY_LIMIT_S:  # called late: what was due is not caught up
             self._due = now
         chunk = self._next(now)
         if chunk is None:
@@ -196,7 +196,7 @@ class JitterBuffer:
         return True
 
     def _next(self, now: float) -> Chunk | None:
-        """Return the next packet's sound, or estimated sound for a gap before it; None if that is used up."""
+        """Return the next packet's sound, or estimated sound for a gap before it; None if there is neither."""
         if not self._waiting:
             if self._last is not None and not self._concealed:
                 self.counters.add("underruns")
@@ -216,6 +216,7 @@ class JitterBuffer:
         return self._play(number, now)
 
     def _play(self, number: int, now: float) -> Chunk | None:
+        """Return the sound of a waiting packet, or of a later one if too much waits; of a damaged one an estimate."""
         received = self._decode(number)
         excess = self._depth.excess(self.waiting_s, now)
         if received is not None and excess > received.seconds - _ROUNDING_S:
@@ -231,7 +232,7 @@ class JitterBuffer:
         return Chunk(samples, received.rate, received.channels)
 
     def _decode(self, number: int) -> ReceivedSound | None:
-        """Return the sound of a waiting packet; None if it is damaged."""
+        """Return the sound of a waiting packet; None if it is damaged or empty."""
         sound = self._waiting.pop(number)
         self._expected = number % _NUMBERS + 1
         try:
@@ -289,7 +290,7 @@ def _faded_in(samples: Samples, rate: int) -> Samples:
 def _faded_over(old: ReceivedSound, new: ReceivedSound) -> ReceivedSound:
     """Return ``new``, with its beginning faded over from ``old``."""
     size = min(len(old.samples), len(new.samples), round(_FADE_S * new.rate))
-    if (old.rate, old.channels) != (new.rate, new.channels) or old is new:
+    if (old.rate, old.channels) != (new.rate, new.channels) or old is new:  # the same: nothing was skipped
         return new
     weight = np.linspace(0.0, 1.0, size)[:, None]
     samples = new.samples.copy()

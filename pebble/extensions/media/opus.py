@@ -48,6 +48,7 @@ def split(body: bytes) -> list[bytes]:
 
 
 def _pieces(body: bytes) -> Iterator[bytes]:
+    """Yield the Opus packets of a body, without their lengths. Raises PayloadError."""
     end = 0  # of the last packet
     while end < len(body):
         start = end + _LENGTH.size
@@ -67,7 +68,12 @@ def milliseconds(packet: bytes) -> float:
         frame_ms = (10, 20)[mode % 2]
     else:  # CELT
         frame_ms = (2.5, 5, 10, 20)[mode % 4]
-    count = (1, 2, 2, packet[1] & 0x3F if len(packet) > 1 else 0)[code]
+    if code == 0:
+        count = 1
+    elif code < 3:
+        count = 2
+    else:  # any number of frames, in the second byte
+        count = packet[1] & 0x3F if len(packet) > 1 else 0
     return frame_ms * count
 
 

@@ -55,6 +55,7 @@ class Resampler:
         self._at = 0  # position of the next output sample, from the beginning of the tail; unit: an input sample / _up
 
     def feed(self, samples: Samples) -> Samples:
+        """Return the next samples at the other rate."""
         if self._up == self._down:
             return samples
         fed = np.concatenate((self._tail, samples.astype(np.float32)))

@@ -109,11 +109,11 @@ def _swing(number: int, period: int, room: int) -> int:
 def _landscape(width: int, height: int) -> Picture:
     """Return a texture with detail of all sizes, as in nature; its right edge continues at its left edge."""
     light = _grids(0, octaves=6, contrast=100)
-    tints = [_grids(100 * channel, octaves=2, contrast=40) for channel in (1, 2, 3)]
+    tints = [_grids(100 * channel, octaves=2, contrast=40) for channel in (1, 2, 3)]  # seeds that are far apart
     picture = np.empty((height, width, 3), np.uint8)
     for top in range(0, height, _STRIPE):  # whole planes of floats would need many times the picture's memory
         rows = np.arange(top, min(top + _STRIPE, height), dtype=np.float32) / np.float32(height)
-        grey = _texture(light, rows, width) + np.float32(118)
+        grey = _texture(light, rows, width) + np.float32(118)  # the mean: that of a texture is 0
         for channel, tint in enumerate(tints):
             stripe = np.asarray(grey + _texture(tint, rows, width), np.float32)
             picture[top : top + _STRIPE, :, channel] = np.clip(stripe, np.float32(0), np.float32(255))

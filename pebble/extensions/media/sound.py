@@ -94,6 +94,7 @@ class SoundEncoder:
         return packets
 
     def _packet(self) -> bytes:
+        """Return the packet of the frames that are ready: ``bundle`` of them, or a single one without a codec."""
         ready, self._ready = self._ready, []
         samples, first_ms = len(ready) * self._samples, max(0, self._ready_ms)
         if self._codec is None:
@@ -124,7 +125,7 @@ def make_sound_encoder(
     numbers = sequence_numbers() if numbers is None else numbers
     rate_out, channels_out = sent_rate or rate, sent_channels or channels
     if name == "pcm":
-        rate_out = rate_out if rate_out <= _HEADER_LIMIT else opus.RATES[-1]
+        rate_out = rate_out if rate_out <= _HEADER_LIMIT else opus.RATES[-1]  # the header holds no more
         return SoundEncoder(_Intake(rate, channels, rate_out, channels_out), numbers, chunk_ms)
     if name == "opus":
         rate_out = next((opus_rate for opus_rate in opus.RATES if opus_rate >= rate_out), opus.RATES[-1])

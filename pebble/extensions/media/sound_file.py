@@ -22,7 +22,7 @@ class SoundFile:
 
     def __init__(self, path: Path) -> None:
         """Open the file. Raises PebbleError if there is no sound in it, and OSError if it cannot be read."""
-        self._name, self._av = path.name, pyav.load(path.suffix.removeprefix("."))
+        self._name, self._av = path.name, pyav.load(path.suffix.removeprefix("."))  # its error names the format
         try:
             self._container = self._av.open(str(path), format=_FORMATS[path.suffix.lower()])
         except (self._av.error.FFmpegError, ValueError) as error:

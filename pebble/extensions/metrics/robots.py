@@ -123,7 +123,7 @@ class Robots:
 
     def __init__(self) -> None:
         self.robots: dict[str, Robot] = {}
-        self._unlisted: set[str] = set()  # heard of since the last scrape
+        self._unlisted: set[str] = set()  # robots without room in ``robots``, heard of since the last scrape
 
     def receive(self, message: Message, now: float, wall: float) -> None:
         """Handle a message of any robot. An empty message does not add an unknown robot."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
@@ -37,6 +37,25 @@ def interrupted_by_signals() -> Iterator[None]:
 
     with handled_by(interrupt):
         yield
+
+
+class _EndedError(KeyboardInterrupt):
+    """An end by SIGTERM of a block of :func:`until_ended`."""
+
+
+def _end(_signal: int, _frame: FrameType | None) -> None:
+    raise _EndedError
+
+
+@contextmanager
+def until_ended() -> Iterator[None]:
+    """Leave the block on SIGTERM, as commands do that run until they are ended. In the main thread only."""
+    before = signal.signal(signal.SIGTERM, _end)
+    try:
+        with suppress(_EndedError):
+            yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager

@@ -167,10 +167,10 @@ async def _estop(request: Request) -> Response:
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         return answer(request, 400, str(error))
     server = _server_of(request)
-    server.stop(op.ref, op.stop, session, "", op.why, login.address_of(request))
+    server.stop(op.ref, op.stop, session, "", op.why, login.address_of(request))  # "": the device is not known
     if not is_form:
         return _plain(request, 202, "sent")
-    until = time.monotonic() + _CONFIRM_S
+    until = time.monotonic() + _CONFIRM_S  # a page that did not start shows nothing after this answer
     while server.stops.robots_of(op.stop).unconfirmed and time.monotonic() < until:
         await asyncio.sleep(TICK_S)
     return _stopped_page(request, 202, _stop_words(server, op.stop))

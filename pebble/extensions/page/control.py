@@ -131,7 +131,7 @@ class Control:
         if "drive" in self._rights():
             server.drivers.restore(hello.token, self._tab)
         server.robots.join(self._interest)
-        self._interest.dirty |= {(ref, "web/driver") for ref in server.robots.components}  # join() leaves them out
+        self._interest.dirty |= {(ref, "web/driver") for ref in server.robots.components}  # `join` has none, see _flush
         self._post(self._ping())
 
     def _end(self) -> None:
@@ -274,7 +274,7 @@ class Control:
 
     def _board(self, op: m.BoardOp) -> None:
         """Allow or end the driving of a board that does not say what it can do, or clear its retained command."""
-        if not self._may("drive" if op.do == "clear" else "system", op):
+        if not self._may("drive" if op.do == "clear" else "system", op):  # to clear changes no permission
             return
         if why := self._server.boards.ask(op, self._session.user):
             self._refuse(op, why)
@@ -315,8 +315,9 @@ class Control:
         def granted() -> None:
             self._audit("take over" if op.over else "take", op.ref)
 
-        is_held = driven.published is not None and driven.published.id != ""
-        if is_held and not op.over:
+        state = driven.published  # of control, by the robot itself
+        is_held = state is not None and state.id != ""
+        if is_held and not op.over:  # the holder may go on: so the request is noted as well as its success
             self._audit("ask", op.ref)
         server.drivers.take(self._tab, robot, granted, lambda why: self._refuse(op, why), over=op.over)
 

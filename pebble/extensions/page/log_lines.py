@@ -123,7 +123,8 @@ def line_of(payload: bytes) -> msgspec.Raw | None:
 def _line(plain: Any) -> Line:
     """Return a log message, of any form, as a line."""
     record = plain if isinstance(plain, dict) else {"message": plain}
-    if not _TEXTS & record.keys() and isinstance(record.get("value"), dict):
+    has_text = not _TEXTS.isdisjoint(record)
+    if not has_text and isinstance(record.get("value"), dict):
         record = record | record["value"]  # {"t": …, "value": {"message": …}}
     text = next((record[name] for name in ("message", "msg", "value") if name in record), record)
     service = _word(record.get("service"))

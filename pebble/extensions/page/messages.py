@@ -71,7 +71,8 @@ class Lease(_FromPage, frozen=True, kw_only=True, tag="lease"):
 class DriveOp(_FromPage, frozen=True, kw_only=True, tag="drive"):
     """Wanted motion of gesture ``g``, every 50 ms while it lasts, and zeros at its end.
 
-    ``final``: this zero is no release by the driver (focus lost, page hidden …): an interrupted script must not resume.
+    After a zero by which the driver lets go, a script that was interrupted may resume. ``final``: it must not, because
+    the page itself has ended the gesture (focus lost, page hidden …).
     """
 
     ref: Ref

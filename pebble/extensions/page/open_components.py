@@ -124,9 +124,9 @@ class OpenComponents:
                         continue
                     self._forget(ref)
                     return
-                await asyncio.sleep(self._step_s)
+                await asyncio.sleep(self._step_s)  # the least time between two changes
                 if ref in self._pages and self._filters(ref).keys() == subscriptions.keys():
-                    return
+                    return  # nothing has changed meanwhile, and nothing failed
         finally:
             self._following.discard(ref)
 
@@ -171,7 +171,10 @@ class OpenComponents:
         self._robots.set_server_metric(ref, _FLAGS_METRIC, view)
 
     def _filters(self, ref: str) -> _Filters:
-        """Return the topics of an open component: the contract's, those it names, and drawings over its picture."""
+        """Return the topics of an open component: the contract's, those it names, and drawings over its picture.
+
+        A topic that has a meaning keeps it, unless it is that of a flag.
+        """
         filters: _Filters = {channel.filter(ref): None for channel in WATCHED}
         for channel in _NAMED:
             self._add(filters, ref, channel)

@@ -87,7 +87,7 @@ class PageClock:
         """True if a message stamped ``t_ms`` by the page may be too old to move anything. Raises ClockJumpError."""
         if not self._answers:
             return True
-        self._check(t_ms / 1000 - now, float("inf"))
+        self._check(t_ms / 1000 - now, float("inf"))  # when it was sent is not known: no limit from above
         oldest_age_s = now - (t_ms / 1000 - self._highest_offset_s())
         usual_s = min(answer.round_trip_s for answer in self._answers)
         return oldest_age_s > min(LATE_S, usual_s + _EXTRA_S)
@@ -96,7 +96,10 @@ class PageClock:
         return min(answer.highest_offset_s for answer in self._answers)
 
     def _check(self, lowest_offset_s: float, highest_offset_s: float) -> None:
-        """Raise ClockJumpError if these limits of the offset contradict the earlier ones."""
+        """Raise ClockJumpError if these limits of the offset contradict the earlier ones.
+
+        They do if the lowest one is above the earlier highest one, or the highest one below the earlier lowest one.
+        """
         if not self._answers:
             return
         earlier_lowest_s = max(answer.lowest_offset_s for answer in self._answers)

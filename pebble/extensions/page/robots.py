@@ -137,10 +137,11 @@ class Robots:
     def take(
         self, interest: Interest, now: float, *, large: bool
     ) -> tuple[tuple[tuple[str, str, Any, float], ...], bool]:
-        """Return the values that this page still needs (None: removed), and whether a large one is among them.
+        """Return the values that this page still needs, and whether a large one is among them.
 
-        They count as sent from now on. The component that the page has open comes first. At most one large value is
-        taken, and only with ``large``. The others, and what does not fit into this message, wait for the next.
+        Each: component, metric, value (None: removed), age in milliseconds. They count as sent from now on. The
+        component that the page has open comes first. At most one large value is taken, and only with ``large``. The
+        others, and what does not fit into this message, wait for the next.
         """
         dirty, interest.dirty = interest.dirty, set()
         taken: list[tuple[str, str, Any, float]] = []
@@ -213,7 +214,7 @@ class Robots:
         self.receive_as(address.identity.base, address.metric, message, now)
 
     def receive_as(self, ref: str, metric: str, message: Message, now: float, channel: c.Channel | None = None) -> None:
-        """Handle a message as if it had come on ``metric``.
+        """Handle a message as if it had come on ``metric`` of component ``ref``: its own topic may name neither.
 
         ``channel``: how to decode it, if the contract does not have it.
         """
@@ -224,7 +225,7 @@ class Robots:
         if channel is c.LOGS:
             self._log(component, message)
             return
-        if not message.payload:
+        if not message.payload:  # a removal, of which the robot's view has to learn as well: see _interpret
             self._remove_value(component, metric)
         trimmed = codec.trim(message.payload)  # pages get it unchanged, inside a JSON message
         if trimmed != message.payload:
@@ -248,9 +249,9 @@ class Robots:
     def refresh(self, now: float) -> None:
         """Send values that change with time. Call this every 0.25 s.
 
-        Whether a component is online is sent at once. Ages are sent each second for open components. The others take
-        turns, each every ``turn_s``: so they are _REFRESHES_PER_S a second, and a thousand robots cause no flood. At
-        most a third of these are sent in one call.
+        Whether a component is online is sent at once. Ages are sent each second for open components. The others
+        take turns, at most _REFRESHES_PER_S of them a second, so that a thousand robots cause no flood. One call sends
+        about a third of this number at most.
         """
         due: list[Component] = []
         opened = {interest.watched for interest in self.interests}
@@ -265,7 +266,7 @@ class Robots:
             elif has_ages and waited_s >= turn_s:
                 due.append(component)
         due.sort(key=lambda component: component.refreshed_at)
-        at_once = 1 + min(len(self.components), _REFRESHES_PER_S) // 3
+        at_once = 1 + min(len(self.components), _REFRESHES_PER_S) // 3  # not a quarter, so that a late call catches up
         for component in due[:at_once]:
             self._refresh(component, now)
 
@@ -292,10 +293,10 @@ class Robots:
 
     def _has_room(self, component: Component, metric: str, channel: c.Channel, more_bytes: int) -> bool:
         """True if a value may be stored. States of motor owners always may, as stop and control depend on them."""
-        if component.lists(metric):  # it is such a state
+        if component.lists(metric):  # it is the state of a motor owner
             return True
-        is_new = metric not in component.values  # of channels that are no patterns there are few
-        if is_new and len(component.values) >= MAX_METRICS and channel.is_pattern:
+        is_new = metric not in component.values
+        if is_new and len(component.values) >= MAX_METRICS and channel.is_pattern:  # the other channels are few
             return False
         return self._bytes + more_bytes <= MAX_BYTES or self.is_kept(component.ref)
 
@@ -352,6 +353,7 @@ class Robots:
         self._store(component, c.CAPABILITIES.metric, c.CAPABILITIES, message, now)
 
     def _log(self, component: Component, message: Message) -> None:
+        """Add a live log line of a watched component, and tell the pages that watch it."""
         lines = self.logs.get(component.ref)
         if lines is None or message.retain or not message.payload:
             return
@@ -368,7 +370,7 @@ class Robots:
                 interest.notify()
 
     def _mark(self, ref: str, metric: str, *, everybody: bool = False) -> None:
-        """Note that pages need a value: all if ``everybody``, or if all show the metric; else those showing ``ref``."""
+        """Note that pages need a value: all if ``everybody`` or it is of FLEET; else those that show ``ref``."""
         channel = _channel(metric)
         everybody = everybody or channel in FLEET
         for interest in self.interests:
@@ -396,12 +398,12 @@ def _aliases(payload: bytes) -> tuple[str, ...]:
 
 
 def _may_be_alias(metric: str) -> bool:
-    """True if neither the contract nor the server itself defines this metric."""
+    """True if a manifest may declare this metric: neither the contract nor the server itself defines it."""
     family = metric.partition("/")[0]
     return (
         _channel(metric) is None
         and not is_reserved(metric)
-        and family not in ("web", "mcu")
+        and family not in ("web", "mcu")  # of the server itself, and the generic topics of MCUs
         and len(metric) <= _LONGEST_ALIAS
         and all(map(_valid_level, metric.split("/")))
     )

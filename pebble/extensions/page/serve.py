@@ -132,8 +132,10 @@ def server_config(settings: WebSettings) -> uvicorn.Config:
 
 
 def listen(settings: WebSettings) -> socket.socket:
+    """Return a socket that is bound to the page's address. Raises PebbleError."""
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
-    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)  # asyncio sets TCP_NODELAY only then
+    # With IPPROTO_TCP, as asyncio sets TCP_NODELAY only on sockets that name it.
+    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux: what is accepted has it, too

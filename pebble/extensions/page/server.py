@@ -183,7 +183,7 @@ class Server:
         return self.stop_broker.transport.outgoing.waiting < _MANY_WAIT
 
     def stop(self, ref: str, name: str, session: Session, device: str, why: str, address: str = "") -> None:
-        """Stop one component, or all (""): at once, and repeatedly until it is confirmed."""
+        """Stop one component, or all (""): at once, and repeatedly until it is confirmed. ``name``: the stop's."""
         by = f"{session.user} on {device}" if device else session.user
         if ref and not _is_base(ref):
             return

@@ -98,14 +98,15 @@ class SilentBoards:
     def _follow(self, component: Component, board: _Board, now: float, spawn: Spawn) -> None:
         """Subscribe to a board's drive topic once it was online for HEARD_S; after that let pages drive it."""
         ref, robot = component.ref, component.robot
-        if board.permission is None:
+        if board.permission is None:  # it is not subscribed to yet
             if not robot.online(now):
                 del self._boards[ref]
             elif now - board.heard_at >= HEARD_S:
                 board.permission = self._permission(ref)
                 spawn(self._subscribe(ref, board))
         elif board.subscription is not None:
-            if robot.assume(board.permission.axes, self._robots.names.get(ref, "")):
+            has_changed = robot.assume(board.permission.axes, self._robots.names.get(ref, ""))
+            if has_changed:  # pages see the capabilities that the robot is assumed to have
                 self._robots.show_announced(component, now)
             view = m.BoardView(
                 silent=True,
@@ -142,7 +143,7 @@ class SilentBoards:
 
         def take(message: Message, now: float) -> None:
             if (robot := self._robots.view(ref)) is not None:
-                robot.receive(DRIVE, message, now, 0.0)
+                robot.receive(DRIVE, message, now, 0.0)  # the wall time is for heartbeats only
 
         try:
             board.subscription = await self._broker.subscribe(DRIVE.topic(ref), take)

@@ -103,6 +103,7 @@ class StaticFiles:
         """
         if name not in self.files:
             return PlainTextResponse("not found", 404)
+        # Of the number four digits do: any client may send a longer one, and it is added to each import.
         if (query := request.scope.get("query_string", b"")).isdigit():
             content = _IMPORT.sub(lambda statement: self._renewed(name, statement, query[:4]), self.files[name])
             return _response(request, name, content, _packed(name, content), headers)
@@ -128,6 +129,7 @@ def root_of(request: Request) -> str:
 
 
 def _packed(name: str, content: bytes) -> bytes | None:
+    """Return the content compressed by gzip; None if its format is compressed already."""
     return None if name.rpartition(".")[2] in _COMPRESSED else gzip.compress(content, 9, mtime=0)
 
 
@@ -139,6 +141,7 @@ def _response(request: Request, name: str, content: bytes, packed: bytes | None,
 
 
 def _read(folder: Traversable, path: str) -> Iterator[tuple[str, bytes]]:
+    """Yield the name and the content of each file; ``path``: what its name begins with."""
     for entry in folder.iterdir():
         suffix = entry.name.rpartition(".")[2]
         if entry.is_dir():

@@ -72,12 +72,13 @@ class Stops:
     ) -> list[Message]:
         """Stop one robot, or all if ``ref`` is "", in place of an earlier stop of the same robots.
 
-        ``known`` are the robots from which messages were received.
+        ``known`` are the robots from which messages were received. ``user`` presses it, and may end it.
         """
         if name in self._stops:
             return []
         robots = [robot for robot in known if ref in ("", robot.base)]
-        named, bases = [ref] if ref else None, [robot.base for robot in robots]
+        named, bases = [ref] if ref else None, [robot.base for robot in robots]  # named None: all that publish
+        # own_only: what a robot's capabilities say cannot lead its stop to topics of others, see Order.
         sender = StopSender(name, by=by, why=why, now=now, robots=named, known=bases, own_only=True)
         older = self._by_ref.get(ref)
         # A stop that others have pressed, too, has no user: none of them may end it.
@@ -105,8 +106,10 @@ class Stops:
         robots = RobotsOfStop([], [])
         if name in self._stops:
             for ref, stop in self._stops[name].sender.robots.items():
-                is_confirmed = stop.progress in (Progress.CONFIRMED, Progress.SPARED)
-                (robots.confirmed if is_confirmed else robots.unconfirmed).append(ref)
+                if stop.progress in (Progress.CONFIRMED, Progress.SPARED):
+                    robots.confirmed.append(ref)
+                else:
+                    robots.unconfirmed.append(ref)
         return robots
 
     def user(self, name: str) -> str | None:

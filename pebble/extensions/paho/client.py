@@ -137,6 +137,7 @@ class PahoClient:
         return len(self._paho.ahead) - self._paho.begin
 
     def receive(self) -> int:
+        """Take bytes out of the socket, for paho to read, and return their number; close it if the other side has."""
         sock, self.drained = self.socket, True
         if sock is None:
             return 0

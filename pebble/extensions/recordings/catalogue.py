@@ -38,6 +38,7 @@ class FileInfo:
 
     @property
     def is_active(self) -> bool:
+        """True if it is being written, or its recorder was killed."""
         return self.path.name.endswith(ACTIVE)
 
 
@@ -145,7 +146,8 @@ def check_names(query: Query, paths: Iterable[Path], places: Iterable[Path]) -> 
     topics = {channel.topic for channel in channels if query.robot is None or is_of(channel.topic, query.robot)}
     for filter_ in query.topics:
         if not any(_matches(filter_, topic) for topic in topics):
-            check_name("topic", filter_, {topic for topic in topics if not topic.startswith("$")}, places)
+            of_robots = {topic for topic in topics if not topic.startswith("$")}  # not those of recorder and broker
+            check_name("topic", filter_, of_robots, places)
 
 
 def check_name(kind: str, name: str | None, known: Collection[str], places: Iterable[Path]) -> None:

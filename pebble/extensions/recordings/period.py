@@ -67,7 +67,10 @@ def _since(text: str, now: datetime) -> int:
 
 
 def _until(text: str, since_ns: int | None, now: datetime) -> int:
-    """Return the end of the period: an age, a date or moment, or a time of day (after ``since_ns`` if there is one)."""
+    """Return the end of a period: ``-5m`` (5 min ago), ``+5m`` (after ``since_ns``), a date, a moment or a time of day.
+
+    A date means its end. A time of day is the next one after ``since_ns``; without ``since_ns``, the latest one.
+    """
     if (age := _AGE.fullmatch(text)) is not None:
         if age[1] == "-":
             return _clipped(_ns(now) - _length_ns(age))
@@ -78,7 +81,7 @@ def _until(text: str, since_ns: int | None, now: datetime) -> int:
         return _moment("--until", text, now, days=1)
     if since_ns is None:
         return _latest("--until", text, now)
-    # Without a zone, drop the offset that astimezone adds: this machine's offset may change before ``moment``.
+    # Without a zone in ``now``, ``since`` loses its fixed offset: ``moment`` may be after a change to summer time.
     since = (_EPOCH + timedelta(microseconds=since_ns // 1000)).astimezone(now.tzinfo).replace(tzinfo=now.tzinfo)
     moment = _time_of_day("--until", text, since)
     return _ns(moment if moment > since else moment + _DAY)

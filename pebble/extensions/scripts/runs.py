@@ -44,7 +44,7 @@ class LocalScripts:
     def hold(self) -> None:
         """Lock the file while a script runs. The script runs even if this fails.
 
-        Where the system refuses the lock, :meth:`none_runs` does not get it either, so neighbours drive nothing.
+        Where the system refuses the lock, :meth:`none_runs` does not get it either: no other robot may drive this one.
         """
         if self._held is None:
             try:
@@ -100,12 +100,12 @@ def following(run: int) -> int:
 def next_run(config: Config, barred: int = 0, received: int = 0) -> int:
     """Return the number of a run that starts now: newer than ``barred``, which motor owners report.
 
-    It is also above every earlier run of this robot, and above ``received``, the newest run whose commands have come.
-    Of these, a number far ahead of ``barred``, as a stranger may send it, counts as older and is left out: the numbers
-    go round.
+    It is also newer than the last run of this robot, which a file holds, and than ``received``, the newest run whose
+    commands have come. Either is left out if it is far ahead of ``barred``, as a number from a stranger may be: the
+    numbers go round, so it counts as older.
 
-    Several processes may call this at once. If the file is missing or damaged, it counts from the clock. Raises
-    PebbleError if another process does not release the file.
+    Several processes may call this at once. If the file is missing or damaged, the number is made from the clock.
+    Raises PebbleError if another process does not release the file.
     """
     return _next(config.state_file("autonomy-run"), barred, time.time, received)
 
@@ -163,7 +163,7 @@ def _above(barred: int, *used: int) -> int:
     """Return the number after the newest of ``barred`` and ``used``; 0 stands for no number.
 
     The numbers form a circle: after the last one comes 1. From ``barred`` on, half of the circle counts as newer, the
-    other half as older. A used number is left out if the number after it is in the older half.
+    other half as older. A used number counts only if the number after it is in the newer half.
     """
     base = barred or newest(used)
     steps_ahead = [(run - base) & LAST_RUN for run in used if run and newer(following(run), base)]

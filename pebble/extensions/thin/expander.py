@@ -42,7 +42,7 @@ class _Robot:
 class Expander:
     """An expander of groups on a connection; its owner calls :meth:`announce` every ANNOUNCE_S.
 
-    If there are several, only the one with the smallest id works, as the announcements of all show. The broker sends
+    Of several, only the one with the smallest id works: each hears the ids in all announcements. The broker sends
     announcements and groups to all expanders in the same order, so no group is taken apart twice. A group that comes
     long after this expander's last announcement has waited, and is dropped. Only streams are published: no state, stop
     or command of a robot. A robot's state ``wire`` may name a short topic for its groups; while two robots name the

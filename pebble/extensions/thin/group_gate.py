@@ -115,6 +115,7 @@ class GroupGate:
             parts = [part._replace(member=replace(part.member, payload=part.message.payload)) for part in parts]
             whole = replace(message, payload=encoded(part.member for part in parts))
             outcome = self._forwarder.deliver(source, subject, whole, forward)
+            # no copies of a group that could not be delivered after all
             deliveries = [(part, copy_of(part.member)) for part in parts] if isinstance(outcome, Forward) else []
         else:
             deliveries = [(part, part.message.payload) for part in parts if part.member.channel.ends(part.member.value)]

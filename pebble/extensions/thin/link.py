@@ -181,7 +181,7 @@ class Room:
 
     def __init__(self, kbit: float | None = None) -> None:
         self._rate = None if kbit is None else _CARRIED * kbit * 125  # bytes/s
-        self._bytes = float(_FIRST_BYTES if self._rate is None else _LEAST_BYTES)
+        self._bytes = float(_FIRST_BYTES if self._rate is None else _LEAST_BYTES)  # that may be on their way
         self._in_flight = InFlight(_SLACK_BYTES, _MOST)
         self._waiting = 0  # bytes that are not confirmed
         self._was_full = False  # since the last poll a message found no room
@@ -192,7 +192,7 @@ class Room:
         confirmed = self._in_flight.acknowledge(waiting)
         if self._rate is not None:
             self._bytes = max(_LEAST_BYTES, self._rate * (round_trip_s + _SOON_S))
-        elif any(now - sent.at - round_trip_s > _SOON_S + _POLL_S for sent in confirmed):
+        elif any(now - sent.at - round_trip_s > _SOON_S + _POLL_S for sent in confirmed):  # one was delayed
             self._bytes = max(_LEAST_BYTES, 0.7 * self._bytes)
         elif self._was_full:  # otherwise there was no need for more
             self._bytes = min(_MOST_BYTES, self._bytes + sum(sent.size for sent in confirmed))
@@ -220,7 +220,7 @@ class LateRun:
 
     def __init__(self) -> None:
         self.count = 0
-        self._since = self._newest_at = 0.0
+        self._since = self._newest_at = 0.0  # when the first and the newest command of the run came
 
     def note(self, late: bool, now: float) -> None:
         """Count a ``late`` command whose sender does not tell its age; a command in time restarts the count."""

@@ -21,7 +21,7 @@ OVERDUE_S = 10.0  # a message that has waited for so long gives way no more
 
 
 class Rank(IntEnum):
-    """The rank of a message: rank N is sent until N times the link's room is in use. Streams wait first."""
+    """The rank of a message. Rank N waits once N times the link's room is in use: streams first, heartbeats last."""
 
     STREAM = 1
     STATE = 2
@@ -54,8 +54,8 @@ class Sieve:
         self._waiting: dict[str, Waiting] = {}  # by topic, in the order in which they began to wait
         self._sent_at: dict[str, float] = {}  # by the topic of a stream, the oldest first
         self._ranks_that_wait: set[Rank] = set()  # those with a message that found no room
-        self._event_waits_since = inf  # since when an event waits in its side's buffer, refused here; inf: none
-        self._event_was_refused = False  # by `takes_event`, since ``due`` was last called for states
+        self._event_waits_since = inf  # when `takes_event` first refused the event that waits; inf: none waits
+        self._event_was_refused = False  # `takes_event` has refused one since the last call of ``due(Rank.STATE)``
 
     def __len__(self) -> int:
         return len(self._waiting)
@@ -80,7 +80,7 @@ class Sieve:
             return False
         older = self._waiting.get(topic)
         if older is not None:
-            self._counters.add("thinned" if self._takes(rank, 0) else "shed")  # it is replaced
+            self._counters.add("thinned" if self._takes(rank, 0) else "shed")  # 0: it only asks for room
             self._waiting[topic] = Waiting(rank, subject, message, forward, older.since)
             return True
         if self._is_turn(rank, topic) and self._passes(rank, message):

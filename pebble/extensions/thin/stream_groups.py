@@ -52,7 +52,7 @@ class StreamGroups:
         self._short_is_heard = False  # by an expander
         self._tries = 0  # empty groups sent to the short topic, so that an expander hears it
         self._remote, self._counters, self._clock = remote, counters, clock
-        self._hz, self._named = link.group_hz, config.security.named
+        self._hz, self._named = link.group_hz, config.security.named  # the latter is only told to expanders
         self._contract_only = config.security.level != "open"  # brokers let an expander publish no others
         self._lock = threading.Lock()  # guards the messages that wait
         self._waiting: dict[str, bytes] = {}  # by metric
@@ -64,7 +64,7 @@ class StreamGroups:
         self._is_announced = False
 
     def heard(self, raw: bytes) -> None:
-        """Note an expander's announcement. If it does not name our short topic, let the expander hear a group there."""
+        """Note an expander's announcement. If it lacks our short topic, send an empty group there to be heard."""
         now = self._clock()
         if now - self._heard_at > HEARD_S:
             self._heard_since, self._tries = now, 0

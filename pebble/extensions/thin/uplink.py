@@ -107,7 +107,7 @@ def make_uplink(
     notifier: Notifier,
     clock: Callable[[], float],
 ) -> Uplink:
-    """Return the uplink of a robot whose link may be thin, or that takes groups of commands."""
+    """Return the uplink of a robot: a thin one if its link may be thin, else a plain one with a gate for groups."""
     if config.services.mqtt_bridge.link.profile != "wide":
         return ThinUplink(config, addresses, remote, forwarder, notifier, clock)
     uplink = Uplink()
@@ -179,6 +179,7 @@ class ThinUplink(Uplink):
         return seconds * _PAUSE if self._meter.level == "thin" else seconds
 
     def poll(self) -> bool:
+        """Measure the link, and send what has room now; return True to have :meth:`heartbeat_due` asked, too."""
         now = self._clock()
         outgoing = self._remote.outgoing
         with self._guard:
@@ -204,9 +205,9 @@ class ThinUplink(Uplink):
                 self._hold.note_drive(self._clock())
 
     def _drop_late(self) -> None:
-        """Drop late commands if there are so many that a stop would wait behind them in the broker's queue.
+        """Connect again if so many late commands come that a stop would wait behind them in the broker's queue.
 
-        They are useless by the time they come, and a new connection drops all that wait. From then on stops have a
+        This drops the commands that wait there: they would be useless by the time they come. From then on stops have a
         connection of their own.
         """
         late, now = self._late, self._clock()

@@ -110,7 +110,7 @@ class EarlierNames:
 
     def __init__(self, config: Config, sides: list[Transport], call_in: CallIn) -> None:
         self._config, self._sides, self._call_in = config, sides, call_in
-        self._begun = config.path is None
+        self._begun = config.path is None  # the search, which is made once
 
     def begin(self) -> None:
         """Look for messages of earlier names. Call this when both sides are connected."""
@@ -167,11 +167,11 @@ class _Removal:
         if any(len(heartbeats) > 1 for heartbeats in self._answers):  # only one of them can be retained
             log.info("%s is another robot now: what is retained under this name is its own", self._name)
             self._end()
-            self._done()
-        elif all(transport.state is State.CONNECTED for transport in self._sides):  # else at the next start
+            self._done()  # the name is forgotten
+        elif all(transport.state is State.CONNECTED for transport in self._sides):
             self._ask(f"{self._name}/#", _note_retained, _ARRIVE_S, self._remove)
         else:
-            self._end()
+            self._end()  # the name is kept: the next start looks again
 
     def _remove(self) -> None:
         self._removed = sum(map(len, self._answers))

@@ -55,6 +55,7 @@ class AliasUse:
         self._rivals.clear()
 
     def _update(self, device: Device, route: Route, alias: Alias) -> None:
+        """Use an alias, or release it while another device claims it or the config names another owner."""
         owner = self._owners.get(alias.claim.partition("/")[2])
         rivals = self._peers.claimants(alias.claim)
         if owner is not None:
@@ -74,6 +75,7 @@ class AliasUse:
             self._end(alias)
 
     def _log_conflict(self, device: Device, claim: str, rivals: list[str], owner: str | None) -> None:
+        """Log when a conflict about a claim begins, and when it ends."""
         before = self._rivals.pop(claim, [])
         if rivals:
             self._rivals[claim] = rivals

@@ -84,10 +84,11 @@ class DescribedBridge(SerialService):
         self._conflict_logged = False  # another device has the same uid
         self.device: Device | None = None
         self._published_states: dict[int, tuple[Reading, int]] = {}  # newest of each state interface, its epoch ms
-        self._generic: list[Subscription] = []  # of the device that was described last, connected or not
+        #: To the generic topics, mcu/…, of the device that was described last, connected or not.
+        self._generic: list[Subscription] = []
         self.aliases = AliasUse(self.log, self._peers, self._begin_alias, self._end_alias, self.options.aliases)
-        self._features = _ProvidedFeatures(Notifier())
-        self._timer: Timer | None = None
+        self._features = _ProvidedFeatures(Notifier())  # such as outlets, for the robot's capabilities
+        self._timer: Timer | None = None  # for the next event of the session, or of the peers
 
     def start(self) -> None:
         self.post(self._subscribe)
@@ -97,6 +98,7 @@ class DescribedBridge(SerialService):
         self._device_gone("the bridge ends")
 
     def on_line_state(self, state: LineState) -> None:
+        """Begin the dialogue with the MCU once it has booted, and end it when the device has gone."""
         now = self.clock()
         if state is LineState.READY:
             self._session.opened(now)
@@ -131,7 +133,7 @@ class DescribedBridge(SerialService):
         self._arm()
 
     def _arm(self) -> None:
-        """Set the timer if the next event is earlier; a timer that is too early does no harm."""
+        """Set the timer, unless it is set for the next event or earlier: a timer that is too early does no harm."""
         times = [due for due in (self._session.due, self._peers.due) if due is not None]
         due = min(times, default=None)
         if due is None or (self._timer is not None and self._timer.due <= due):
@@ -163,10 +165,11 @@ class DescribedBridge(SerialService):
                         self.device_log.log(subject, level, "%s", reason)
 
     def _report(self, reading: Reading) -> None:
+        """Publish a reading of the MCU, and note it for the checks of its sensors."""
         device, now_ms = self.device, _now_ms()
         is_motion = reading.interface.profile == MOTION
         has_motion = device is not None and device.has_motion
-        if is_motion or not has_motion:  # other readings do not show that the inertial sensor works
+        if is_motion or not has_motion:  # of a board with motion, other readings do not show that the sensor works
             self.watchdog.sample(self.clock())
         if is_motion:
             self.sensors.take(measured(reading.values), self.clock())
@@ -212,7 +215,7 @@ class DescribedBridge(SerialService):
             self.log.warning(text, uid)
 
     def _publish_device(self, manifest: Manifest) -> None:
-        """Receive the commands of a device that has described itself, and publish what it is."""
+        """Subscribe to the commands for a device that has described itself, and publish what it is."""
         device = self.device = Device(manifest, self.addresses, ImuReports(self.options, self.instance))
         hello = device.hello
         self.log.info("%s: %r, firmware %r, %d interfaces", device.uid, hello.model, hello.firmware_version,
@@ -225,11 +228,11 @@ class DescribedBridge(SerialService):
         for subscription in self._generic:
             subscription.close()
         self._generic = [self.follow_driving()] if device.has_motion else []
-        self._listen_generic(device, private=False)  # a reader of the manifest may send commands at once
+        self._listen_generic(device, private=False)  # first: a reader of the manifest may send some at once
         self.publish(MCU_LOCAL_ONLY, device.local_only, uid=device.uid)
         self.publish(MCU_DESCRIBE, device.payload, uid=device.uid)
-        self.publish(MCU_COMMAND, {"from": self._token}, uid=device.uid, name=RESERVED)  # _UID_QUERY: who else has it?
-        self._listen_generic(device, private=True)  # after the list by which bridges keep these on the robot
+        self.publish(MCU_COMMAND, {"from": self._token}, uid=device.uid, name=RESERVED)  # bridges of the same uid warn
+        self._listen_generic(device, private=True)  # last: by MCU_LOCAL_ONLY bridges keep these topics on the robot
         self.aliases.announce(device)
         self.call_at(self.clock() + CLAIM_S, partial(self.aliases.permit, device))
 
@@ -249,6 +252,7 @@ class DescribedBridge(SerialService):
         self.retract(MCU_LOCAL_ONLY, uid=device.uid)
 
     def _listen_generic(self, device: Device, *, private: bool) -> None:
+        """Subscribe to the device's commands: to those that it marks ``local_only`` (``private``), or to the others."""
         self._generic += [
             self.listen(route.generic, partial(self._command, device, route))
             for route in device.routes.values()
@@ -279,6 +283,7 @@ class DescribedBridge(SerialService):
             self._send_commands(commands)
 
     def _command(self, device: Device, route: Route, values: dict[str, Any]) -> None:
+        """Send a command to the MCU, if that is still ``device``, for which its topic was subscribed to."""
         name = route.interface.name
         if self._takes_groups and values.get(groups.MARK) is True:
             return  # a copy for programs that take no groups: here the group itself arrives
@@ -355,7 +360,7 @@ class DescribedBridge(SerialService):
             self._peers.forget(uid)
         else:
             self._peers.add(uid, frozenset(claims(manifest).granted), self.clock(), retained=retained)
-            if retained:  # ask its bridge for it; if that does not publish it again in time, _tick removes it
+            if retained:  # ask the device's bridge for the manifest: one that does not come in time, _tick removes
                 self.publish(MCU_COMMAND, {}, uid=uid, name=RESERVED)
         self.aliases.update()
         self._arm()

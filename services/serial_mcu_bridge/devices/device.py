@@ -102,6 +102,10 @@ class Device:
         return Route(interface, generic, self._alias(interface, payload))
 
     def _alias(self, interface: Interface, payload: Any) -> Alias | None:
+        """Return the alias of an interface; None if the channel it names is another interface's or the robot's own.
+
+        ``payload``: the type of the payloads on the interface's generic channel, the one below ``mcu/``.
+        """
         claim = f"{c.INCOMING if interface.direction is Direction.IN else c.OUTGOING}/{interface.channel}"
         if self.claims.granted.get(claim) != interface.name:
             return None

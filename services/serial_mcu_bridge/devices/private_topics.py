@@ -28,13 +28,13 @@ class LocalOnly(PrivateTopics):
         self._private: dict[str, frozenset[str]] = {}  # topics by uid; also of an MCU that has gone
         self._listed: set[str] = set()  # the uids whose list is valid now
         self._waiting: dict[str, Message] = {}  # by topic
-        self._values = f"{base}/{MCU_VALUE.suffix.partition('{')[0]}"
-        self._commands = f"{base}/{MCU_COMMAND.suffix.partition('{')[0]}"
+        self._before_values = f"{base}/{MCU_VALUE.suffix.partition('{')[0]}"  # begins their topics; a uid follows
+        self._before_commands = f"{base}/{MCU_COMMAND.suffix.partition('{')[0]}"
 
     def stays(self, topic: str) -> bool:
         """True if ``topic`` is on a list, is a command to an MCU without a list, or a request for a manifest."""
-        if topic.startswith(self._commands):
-            uid = topic.removeprefix(self._commands).partition("/")[0]
+        if topic.startswith(self._before_commands):
+            uid = topic.removeprefix(self._before_commands).partition("/")[0]
             if uid not in self._listed or topic.endswith(_DESCRIBE):
                 return True
         return bool(self._private) and any(topic in topics for topics in list(self._private.values()))
@@ -44,8 +44,8 @@ class LocalOnly(PrivateTopics):
         with self._lock:
             if not message.payload:
                 self._waiting.pop(message.topic, None)  # removed: nothing to forward any more
-            if message.topic.startswith(self._values) and message.topic.endswith(_LIST):
-                self._learn(message.topic.removeprefix(self._values).removesuffix(_LIST), message.payload)
+            if message.topic.startswith(self._before_values) and message.topic.endswith(_LIST):
+                self._learn(message.topic.removeprefix(self._before_values).removesuffix(_LIST), message.payload)
                 waiting, self._waiting = self._waiting, {}
                 admitted: list[Message] = []
                 for held in waiting.values():  # those of other MCUs go on waiting
@@ -66,7 +66,10 @@ class LocalOnly(PrivateTopics):
             self._listed.add(uid)
 
     def _judge(self, message: Message) -> list[Message]:
-        """Return ``message`` if it may pass. A retained value of an MCU without a list is kept until there is one."""
+        """Return ``message`` if it may pass. A retained value of an MCU without a list is kept until its list comes.
+
+        An empty message holds no value, so it needs no list.
+        """
         if self.stays(message.topic):
             return []
         uid = self._uid_of(message)
@@ -79,8 +82,8 @@ class LocalOnly(PrivateTopics):
 
     def _uid_of(self, message: Message) -> str | None:
         """Return the uid of the MCU whose value this is; None for a manifest, or another program's message."""
-        if message.topic.startswith(self._values):
-            uid = message.topic.removeprefix(self._values).partition("/")[0]
+        if message.topic.startswith(self._before_values):
+            uid = message.topic.removeprefix(self._before_values).partition("/")[0]
             return None if message.topic.endswith(_DESCRIBE) else uid
         sample = _object(message.payload) if _MARK in message.payload else {}  # of an alias: the uid is inside
         sender = sample.get("device_uid")

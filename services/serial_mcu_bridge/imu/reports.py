@@ -46,7 +46,7 @@ class ImuReports:
         self._newest: ImuFastValues | None = None
 
     def motion(self, t: int, seq: int, mcu_ms: int, values: Values) -> ImuFast:
-        """Return a sample as a payload; ``values`` by the profile's fields: m/s², degrees per second, °C, degrees."""
+        """Return a sample as a payload. ``values``: the fields of MOTION, in m/s², degrees per second, °C, degrees."""
         self._newest = ImuFastValues(
             accel_mps2=_vector(values, *_ACCELERATION),
             gyro_dps=_vector(values, *_ROTATION),

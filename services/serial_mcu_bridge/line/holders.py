@@ -19,7 +19,7 @@ def holders(path: str) -> list[str]:
             for number in os.listdir(process / "fd"):  # noqa: PTH208 - a Path for each is slow
                 with suppress(OSError):
                     files.add(os.readlink(f"{process}/fd/{number}"))  # noqa: PTH115
-        is_simulator = any(file.endswith(_PTY_MASTER) for file in files)
+        is_simulator = any(file.endswith(_PTY_MASTER) for file in files)  # it has the board's end of a pty
         if device in files and process.name != str(os.getpid()) and not is_simulator:
             with suppress(OSError):
                 name = (process / "comm").read_text(encoding="utf-8", errors="replace").strip()

@@ -17,8 +17,8 @@ class Silence:
     def __init__(self) -> None:
         self._opened = 0  # how often the line was opened, at the last check
         self._received = 0  # how many messages had come, at the last check
-        self._received_at: float | None = None
-        self._counted_at = 0.0
+        self._received_at: float | None = None  # when a message last came; None: none since the line was opened
+        self._counted_at = 0.0  # when ``_unasked`` was last updated
         self._unasked = 0  # checks in a row in which data had come unasked
 
     def check(self, state: LineState, opened: int, received: int, now: float, *, idle: bool) -> tuple[str, int | None]:
@@ -33,7 +33,7 @@ class Silence:
         self._received = received
         if has_sent:
             self._received_at = now
-        if self._unasked < _REGULAR and now - self._counted_at >= 0.9 * CHECK_S:  # extra checks do not count
+        if self._unasked < _REGULAR and now - self._counted_at >= 0.9 * CHECK_S:  # sooner it is an extra check
             self._counted_at = now
             self._unasked = self._unasked + 1 if has_sent and idle else 0
         if self._received_at is None or state is not LineState.READY:

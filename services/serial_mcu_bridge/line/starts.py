@@ -12,7 +12,7 @@ class Starts:
 
     def __init__(self) -> None:
         self._starts: deque[float] = deque(maxlen=1000)
-        self._opened = 0
+        self._opened = 0  # the opening of the line at the last call; 0: there was none
         self._clock_opened = self._clock_ms = -1  # the newest reading of the board's clock, and in which opening
 
     def began(self, now: float) -> None:

@@ -98,7 +98,7 @@ def stuff(data: bytes) -> bytes:
     for part in closed:
         blocks += _full_blocks(part) + _block(part)
     blocks += _full_blocks(last)
-    if not last or len(last) % _BLOCK:  # else the last full block is the end
+    if not last or len(last) % _BLOCK:  # else it ends with a full block, which implies no zero
         blocks += _block(last)
     return bytes(blocks)
 
@@ -108,13 +108,13 @@ def unstuff(stuffed: bytes) -> bytes:
     data = bytearray()
     at, end = 0, len(stuffed)
     while at < end:
-        code = stuffed[at]
+        code = stuffed[at]  # how many bytes the block has, this one included
         block = stuffed[at + 1 : at + code]
         if code == 0 or len(block) != code - 1 or 0 in block:
             raise PayloadError("is not byte-stuffed")
         data += block
         at += code
-        if code <= _BLOCK and at < end:
+        if code <= _BLOCK and at < end:  # unless it is full, or the last, a block stands for a zero after it, too
             data.append(0)
     return bytes(data)
 
@@ -125,6 +125,6 @@ def _full_blocks(part: bytes) -> bytes:
 
 
 def _block(part: bytes) -> bytes:
-    """Return the last COBS block of ``part``: the bytes after its full blocks. It also stands for a zero after them."""
+    """Return ``part``'s last COBS block: the bytes after its full blocks. If another follows, it implies a zero."""
     last = part[len(part) - len(part) % _BLOCK :]
     return bytes((len(last) + 1,)) + last

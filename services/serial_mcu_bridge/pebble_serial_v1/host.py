@@ -257,6 +257,7 @@ class Session:
         yield described
 
     def _reading(self, frame: Frame, now: float) -> Iterator[Event]:
+        """Yield the values in a frame. If they do not fit the manifest, request it again: the MCU may have another."""
         if self.manifest is None:
             yield RefusedInput("early", "a reading before the manifest", logging.DEBUG)
             return

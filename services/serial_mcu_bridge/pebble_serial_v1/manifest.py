@@ -21,7 +21,7 @@ RESERVED, LOCAL_ONLY = "describe", "local-only"
 MOST_INTERFACES = 64  # with 64 fields each they exceed FRAME_LIMIT: frame.py says what fits
 _MOST_FIELDS = 64  # of one interface
 _MOST_LEVELS = 8  # of a channel
-_ENCODINGS = {1: "struct_v1"}
+_ENCODINGS = {1: "struct_v1"}  # by number: so far there is one, so no interface stores which it has
 _RETAIN, _LOCAL_ONLY = 1, 2  # bits of an interface's flags; the others are reserved
 
 _level = re.compile(LEVEL).search

@@ -93,14 +93,14 @@ def _layout(types: tuple[FieldType, ...]) -> struct.Struct:
 
 
 def _value(field: Field, raw: Any) -> Any:
-    """Return a field's value for JSON: the packed number, scaled, with no digits that it does not have."""
+    """Return a field's value for JSON: the packed number, scaled and rounded, so that 3 × 0.1 is 0.3."""
     if field.type is FieldType.BOOL:
         return raw
     if field.type is FieldType.F32:
         if not math.isfinite(raw):
             raise PayloadError(f"{field.name} is not a finite number")
-        raw = shortest(raw)
-    if field.plain:
+        raw = shortest(raw)  # the decimal with the fewest digits
+    if field.plain:  # it has neither scale nor offset
         return raw
     return float(f"{raw * field.scale + field.offset:.{_DIGITS}g}")
 

@@ -32,9 +32,9 @@ class HallMemory:
     def __init__(self, name: str, slots: int = 2048) -> None:
         self._path, self._slots = SHM / name.removeprefix("/"), slots
         self._size = _HEADER.size + slots * _SLOT.size
-        self._number = 0
+        self._number = 0  # of the newest sample
         self._opened: tuple[int, mmap.mmap, memoryview] | None = None  # descriptor, memory, and its words of 8 bytes
-        self._check_at_ns = 0
+        self._check_at_ns = 0  # when to look next whether the memory's file is still there
         self._problem = ""
 
     def write(self, at_ns: int, values: tuple[int, int, int], charging: bool | None) -> None:
@@ -59,7 +59,7 @@ class HallMemory:
             os.close(descriptor)
 
     def _keep(self) -> None:
-        """Open the memory if it is not open, or its file is gone: a reader by SharedMemory removes it when it ends."""
+        """Open the memory if it is not open, or its file is gone: readers by SharedMemory remove it when they end."""
         if self._opened is not None and self._in_place(self._opened[0]):
             return
         self.close()

@@ -59,7 +59,7 @@ class MotorBridge(MotorOwner, SerialService):
         super().__init__(*arguments, **options)
         self._publishes_touch = self.options.telemetry.publish_touch_sensors
         self._power, self._again_at = (0.0, 0.0), 0.0  # (left, right) as published last, and when it is due again
-        self._charging: ChargingStatus | None = None
+        self._charging: ChargingStatus | None = None  # as published last: it is published only when it changes
         memory = self.config.hall_memory(self.options)
         self._hall = None if memory is None else HallMemory(memory)
         self._splitter = LineSplitter()
@@ -102,7 +102,7 @@ class MotorBridge(MotorOwner, SerialService):
         self._show_power(0.0, 0.0)
 
     def _show_power(self, left: float, right: float) -> None:
-        """Publish the commanded power of the wheels, for their sensors: each change, and again while they run."""
+        """Publish the power that the wheels are commanded, for odometry: each change, and again while not zero."""
         now = self.clock()
         if self._publishes_touch and ((left, right) != self._power or ((left or right) and now >= self._again_at)):
             self._power, self._again_at = (left, right), now + _AGAIN_S
@@ -133,7 +133,7 @@ class MotorBridge(MotorOwner, SerialService):
                 self.note_report(is_known(report))
                 self._report(report)
             if self._hall is not None:
-                self._keep_samples(self._hall, reports)  # last: they are kept with what the line says of the charger
+                self._keep_samples(self._hall, reports)  # last, as it needs what this line says of the charger
         self.count_discarded(self._splitter.discarded_lines)
 
     def _keep_samples(self, hall: HallMemory, reports: list[Report]) -> None:

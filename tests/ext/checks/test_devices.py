@@ -61,26 +61,40 @@ def test_a_number_that_may_change(tmp_path: Path, name: str, links: dict[str, st
 
 
 @pytest.mark.parametrize(
-    ("place", "usable", "state", "text", "fix"),
+    ("place", "boards", "usable", "state", "text", "fix"),
     [
-        ("gone", True, State.FAILED, "is the MCU plugged in?", "ls -l "),
-        ("file", True, State.FAILED, "is not a device", f"correct {KEY}"),
-        ("tty", True, State.OK, "readable and writable", ""),
-        ("tty", False, State.FAILED, "only be used by its owner", "sudo usermod -aG $(stat -c %G /"),
+        ("gone", "", True, State.FAILED, "is the MCU plugged in?", "plug it in, then: ls DIR/by-id/*; and set a.b"),
+        ("gone", "x", True, State.FAILED, "is the MCU plugged in?", "set a.b to DIR/by-id/x"),
+        ("gone", "yx", True, State.FAILED, "is the MCU plugged in?", "set a.b to DIR/by-id/x or DIR/by-id/y"),
+        ("file", "x", True, State.FAILED, "is not a device", f"correct {KEY}"),
+        ("tty", "x", True, State.OK, "readable and writable", ""),
+        ("tty", "x", False, State.FAILED, "only be used by its owner", "sudo usermod -aG $(stat -c %G /"),
     ],
 )
 def test_serial_port(
-    place: str, usable: bool, state: State, text: str, fix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    place: str,
+    boards: str,
+    usable: bool,
+    state: State,
+    text: str,
+    fix: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    names = tmp_path / "serial"
+    (names / "by-id").mkdir(parents=True)
+    for board in boards:
+        (names / "by-id" / board).touch()
     (tmp_path / "file").touch()
     (tmp_path / "tty").symlink_to(os.ttyname(os.openpty()[1]))
     monkeypatch.setattr(os, "access", lambda *_: usable)
-    result = serial_port(tmp_path / place, KEY)
-    assert (result.state, text in result.text, result.fix.startswith(fix)) == (state, True, True)
+    result = serial_port(tmp_path / place, KEY, names)
+    assert (result.state, text in result.text) == (state, True)
+    assert result.fix.startswith(fix.replace("DIR", str(names)))
 
 
 CAMERA = {"enabled": True, "video": {"device": "0"}}
-NO_CAMERA = (State.FAILED, "video0 does not exist", "ls -l ")
+NO_CAMERA = (State.FAILED, "video0 does not exist", "plug it in, then: ls ")
 NO_MICROPHONE = (State.FAILED, "arecord is not installed", "sudo apt install alsa-utils")
 #: The services of a robot, the programs of its machine, whether there is a camera, and what is found.
 MEDIA: list[tuple[dict[str, Any], list[str], bool, list[tuple[State, str, str]]]] = [

@@ -1,4 +1,4 @@
-"""Each check finds its problem, with the command that fixes it."""
+"""Each check finds its problem, and says what ends it."""
 
 from __future__ import annotations
 
@@ -197,8 +197,24 @@ def test_a_server_that_is_no_broker_is_a_problem() -> None:
     assert attempt(wrong_file, login=True).problem != ""
     unknown = MqttSettings(host="ü" * 60, port=free_port())
     assert attempt(unknown, login=True).problem.endswith("is no name of a host")
-    (finding,) = login.broker("local broker", MqttSettings(host="127.0.0.1", port=free_port()))
-    assert finding.fix == "sudo systemctl start mosquitto"
+
+
+#: Where a broker is that cannot be reached, whether this machine has mosquitto, and what to do.
+UNREACHED = [
+    ("127.0.0.1", "mosquitto", "sudo systemctl start mosquitto"),
+    ("127.0.0.1", None, "sudo apt install mosquitto"),
+    ("b.lab", None, "on b.lab: sudo systemctl start mosquitto; or correct the address b.lab:1"),
+]
+
+
+@pytest.mark.parametrize(("host", "mosquitto", "fix"), UNREACHED)
+def test_a_broker_that_cannot_be_reached(
+    host: str, mosquitto: str | None, fix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(login, "attempt", lambda *_, **__: LoginAttempt(problem="refused"))
+    monkeypatch.setattr(login, "mosquitto_path", lambda: mosquitto)
+    (finding,) = login.broker("b", MqttSettings(host=host, port=1))
+    assert finding.fix == fix
 
 
 @pytest.mark.parametrize(

@@ -193,6 +193,8 @@ def test_a_pulled_board_is_named(rig: Rig) -> None:
     rig.mcu.command("unplug")
     assert until(lambda: found(rig, only("boards"), 1.0)["boards"][0] == "failed")
     assert str(rig.mcu.port) in found(rig, only("boards"), 1.0)["boards"][1]
+    stop = found(rig, only("stop"))["stop"]
+    assert (stop[0], "nothing confirms that its motors stand" in stop[1]) == ("failed", True)
     rig.mcu.command("replug")
     assert until(lambda: found(rig, only("boards"))["boards"][0] == "ok")
 

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from pebble.contract import AUTONOMY_COMMAND, CONTROL_TAKE, DRIVE, ESTOP, ESTOP_RESET, codec
 from pebble.contract import channels as c
@@ -30,6 +31,7 @@ from pebble.extensions.fleet.robot_audit import ROBOT, files
 from pebble.extensions.fleet.robot_audit import Audit as RobotAudit
 from pebble.extensions.fleet.row_writer import DIFFERENT, OF_STRANGERS, WAITING, WINDOW_S, RowWriter
 from pebble.forwarding.routing import Drop
+from tests.ext.operator.client.estop_robot import estop_state
 from tests.services.mqtt_bridge.bridge_rig import make_config
 from tests.support import WAIT_S, quickly, until
 
@@ -262,8 +264,8 @@ DISK_IS_FULL = "No space left on device"
 class Log:
     """An audit with a folder of its own, and its rows but for their times."""
 
-    def __init__(self) -> None:
-        config = make_config()
+    def __init__(self, *owners: str) -> None:
+        config = replace(make_config(), motor_owners=owners)
         self.path, self.older = files(config)
         self.now = 0.0
         self.audit = RobotAudit(config, lambda: self.now)
@@ -389,6 +391,34 @@ def test_control_is_given_and_ends(log: Log) -> None:
     passed = [ended | holder, given | other, ended | other, given | nobody, ended | nobody, given | holder]
     assert log.rows() == passed
     assert "aa" not in log.path.read_text()
+
+
+RESET = ("", None)
+#: Motor owners; what happens: a reset passes, or an owner publishes why it has refused one; the rows about refusals.
+ANSWERS: dict[str, tuple[str, list[tuple[str, str | None]], list[str]]] = {
+    "obeyed": ("a", [("a", None), RESET, ("a", None)], []),
+    "refused": ("a", [("a", None), RESET, ("a", "count")], ["a count"]),
+    "by an owner that has restarted": ("a", [("a", None), RESET, ("a", "boot")], ["a boot"]),
+    "once more": ("a", [("a", None), RESET, ("a", "old"), RESET, ("a", "old")], ["a old", "a old"]),
+    "and the state comes again": ("a", [("a", None), RESET, ("a", "count"), ("a", "count")], ["a count"]),
+    "before it is noted": ("a", [("a", None), ("a", "count"), RESET], ["a count"]),
+    "before the start": ("a", [("a", "old")], []),
+    "for another owner": ("ab", [("a", None), ("b", None), RESET, ("a", "boot"), ("b", None)], []),
+}
+
+
+@pytest.mark.usefixtures("log")
+@pytest.mark.parametrize("name", ANSWERS)
+def test_a_reset_that_a_motor_owner_refuses_is_told(name: str) -> None:
+    owners, events, refusals = ANSWERS[name]
+    log = Log(*owners)
+    for owner, why in events:
+        if (owner, why) == RESET:
+            log.send(ESTOP_RESET, "ann", boot="b", count=1)
+        else:
+            log.audit.estop(owner, estop_state(reset_refused=why))
+    rows = [f"{row['owner']} {row['why']}" for row in log.rows() if row["what"] == "reset-refused"]
+    assert rows == refusals
 
 
 def test_refusals_of_one_kind_and_sender_are_one_row(log: Log) -> None:

@@ -100,7 +100,7 @@ def test_a_held_key_drives_and_its_release_stops(drive: Drive, lamp: RecordingRo
 
 #: What ends a drive, and the exit status; None: the program goes on.
 ENDS: dict[str, tuple[Callable[[Terminal], object], int | None]] = {
-    "SIGTERM": (lambda console: console.process.send_signal(signal.SIGTERM), 1),
+    "SIGTERM": (lambda console: console.process.send_signal(signal.SIGTERM), 0),
     "SIGQUIT": (lambda console: console.process.send_signal(signal.SIGQUIT), 1),
     "Ctrl-D": (lambda console: (console.hold(b""), console.type(b"\x04")), 0),
     "space": (lambda console: (console.hold(b""), console.type(b" ")), None),
@@ -253,6 +253,35 @@ def test_a_reason_ends_the_drive_and_the_keys_must_be_released(event: str, words
     cab.receive(*(owner.state() for owner in cab.robot.owners))
     assert [command for command in cab.run(2.0, "w") if command["z"]] == []
     assert cab.moves() is (event != "stopped")
+
+
+BOARD = "serial: no board"
+#: What the robot's status says of its motors, and the status line at rest, with a key held, and after the stop.
+MOTORS = {
+    "no": ("Cannot be driven: B", "Cannot be driven: B", "Stopped by me · nothing confirms that its motors stand: B"),
+    "unknown": (
+        "ready · Not known whether it can be driven: B",
+        "driving x +0.00 z +0.60 · Not known whether it can be driven: B",
+        "Stopped by me · it is not known whether its motors stand: B",
+    ),
+    "yes": ("ready", "driving x +0.00 z +0.60", "Stopped by me"),
+}
+
+
+@pytest.mark.parametrize("state", MOTORS)
+def test_the_status_says_whether_commands_reach_the_motors_and_a_stop_is_sent_all_the_same(state: str) -> None:
+    cab = Cab().ready()
+    cab.receive(outgoing(GOOB, "status", {"value": {"driveable": {"state": state, "why": BOARD}}}))
+    shown = [cab.driver.status()]
+    cab.run(0.5, "w")
+    shown.append(cab.driver.status())
+    cab.driver.press(["!"], cab.now)
+    cab.run(0.1)
+    cab.receive(*cab.robot.take([message for message in cab.sent if message.topic == ESTOP][:1]))
+    cab.run(1.0)
+    assert cab.robot.owners[0].latch.latched
+    shown.append(cab.driver.status().replace("ann@desk", "me"))
+    assert shown == [f"goob · {line}".replace(": B", f": {BOARD}") for line in MOTORS[state]]
 
 
 def test_keys_that_were_held_back_on_the_way_move_nothing() -> None:

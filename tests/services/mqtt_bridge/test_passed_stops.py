@@ -334,6 +334,7 @@ def test_a_broker_that_denies_it_costs_one_line_and_is_tried_every_ten_minutes(
     ("pauses", "ended", "state"),
     [
         ("2 2 2", True, State.CONNECTED),  # something else ends it
+        ("0.5 0.5", True, State.CONNECTED),
         ("0.5 0.5 2 0.5 0.5 0.5", True, State.CLOSED),
         ("0.5 0.5 0.5", False, State.CONNECTED),
     ],

@@ -23,6 +23,7 @@ from pebble.extensions.lab.simulation.pty import PtyMcu
 from pebble.runtime.process import view_of
 from pebble.services.serial_mcu_bridge.line.holders import holders
 from pebble.services.serial_mcu_bridge.line.port import Port
+from pebble.services.serial_mcu_bridge.line.starts import Starts
 from pebble.services.serial_mcu_bridge.text.motor_bridge import MotorBridge
 from pebble.transports import Message, MqttSettings, QoS, State, create
 from pebble.transports.memory import MemoryHub, MemoryTransport
@@ -212,9 +213,17 @@ def test_every_field_of_a_line_is_published_and_what_the_motors_get_again_while_
     bench.mcu.charge(True)
     assert until(lambda: bench.payloads("charging-status")[-1] == {"value": True})
     assert bench.payloads("charging-status") == [{"value": False}, {"value": True}], "changes alone are published"
+    began = time.monotonic()
     assert until(lambda: bench.drive(0.5) or len(bench.payloads("motor-power/serial")) >= 3)
+    assert time.monotonic() - began > 0.9, "at most twice a second"
     assert {tuple(power.values()) for power in bench.payloads("motor-power/serial")} == {(0.5, 0.5)}
     assert until(lambda: bench.payloads("motor-power/serial")[-1] == {"left": 0.0, "right": 0.0})
+
+
+def test_what_a_board_says_at_its_start_counts(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    starts: list[float] = []
+    monkeypatch.setattr(Starts, "began", lambda _starts, now: starts.append(now))
+    assert until(lambda: bench.mcu.reset() or starts, step=0.2)
 
 
 def test_a_drive_command_without_an_axis_is_logged_once_for_each_sender(

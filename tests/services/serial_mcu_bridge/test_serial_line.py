@@ -154,7 +154,7 @@ def test_the_stop_is_the_last_line_even_while_others_still_drive(mcu: PtyMcu, co
         assert mcu.trace.lines()[-1] == STOPPED
 
 
-def test_after_a_replug_the_first_line_is_the_stop(mcu: PtyMcu, host: Host) -> None:
+def test_after_a_replug_the_first_line_is_the_stop(mcu: PtyMcu, host: Host, caplog: pytest.LogCaptureFixture) -> None:
     host.line.drive(drive_line(0.7, 0.7))
     assert traced(mcu, "M 0.700 0.700")
     mcu.unplug()
@@ -165,6 +165,7 @@ def test_after_a_replug_the_first_line_is_the_stop(mcu: PtyMcu, host: Host) -> N
     mcu.replug()
     assert until(host.is_ready)
     assert host.line.problem == ""
+    assert "gone" in caplog.text
     assert until(lambda: host.line.drive(drive_line(0.9, 0.9)))
     assert traced(mcu, "M 0.900 0.900")
     entries = mcu.trace.entries()
@@ -260,6 +261,7 @@ def test_a_stuck_reader_does_not_block_and_finds_no_old_commands_later_and_the_s
         assert until(lambda: LineState.ABSENT in host.states, step=0.001)
         assert len(stuck.seen()) < 5000
         assert until(lambda: host.states.count(LineState.READY) == 2)
+        assert host.line.received == 0
         assert until(lambda: stuck.seen().endswith(b"\n" + STOP + STOP))
         assert len(stuck.seen()) < 5000
         host.line.drive(drive_line(0.4, 0.4))

@@ -17,7 +17,7 @@ from msgspec.structs import replace
 
 from pebble.errors import TransportError
 from pebble.extensions.media.frames import FrameReader, FrameWriter
-from pebble.transports import QoS, ZenohSettings, create
+from pebble.transports import QoS, TlsSettings, ZenohSettings, create
 from pebble.transports.peers import PeerRegistry, prepare_run_dir
 from pebble.transports.zenoh import callbacks, wire
 from pebble.transports.zenoh.callbacks import direct
@@ -145,6 +145,11 @@ def session(tmp_path: Path) -> Iterator[zenoh.Session]:
     opened = open_session(session_config(ZenohSettings(run_dir=tmp_path), "peer", listen=[], connect=[]))
     yield opened
     close_session(opened)
+
+
+def test_a_network_card_is_named_by_its_number(tmp_path: Path) -> None:
+    settings = ZenohSettings(run_dir=tmp_path, connect=("tls/[fe80::1%lo]:7447",), tls=TlsSettings())
+    assert '"tls/[fe80::1%1]:7447"' in session_config(settings, "peer", listen=[], connect=[])
 
 
 def test_a_hub_that_has_just_died_holds_up_no_answer_of_another(session: zenoh.Session) -> None:

@@ -424,7 +424,7 @@ def test_a_hub_that_meets_another_says_so(tmp_path: Path, caplog: pytest.LogCapt
 def test_a_hello_of_a_client_that_is_gone_leaves_a_will(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(wills, "RETURN_S", 0.1)
     settings = ZenohSettings(run_dir=tmp_path / "run")
-    hello = wire.Hello("gone", 0, wire.Will("status", b"gone", DELIVERED, True), {})
+    hello = ["gone", 0, ["status", b"gone", DELIVERED, True], {}]  # as clients of every version send it
     with contextlib.closing(ZenohHub(settings).open()) as hub, create("zenoh", "client", settings) as client:
         session: zenoh.Session = client.session  # type: ignore[attr-defined]
         session.liveliness().declare_token(wire.LIVE + "gone").undeclare()

@@ -47,7 +47,7 @@ class ZenohHub:
             from pebble.transports.credentials import renewed_context  # ssl, which few hubs need
 
             self._certificates = renewed_context(settings.tls)
-        self._used = self._newest  # the certificates and rules of the session
+        self._used = self._newest  # the certificates and rules of the session: first those in the files now
 
     @property
     def retained(self) -> dict[str, bytes]:
@@ -132,7 +132,7 @@ class ZenohHub:
 
     def _listen(self, worker: HubWorker) -> None:
         self._session = None
-        siblings = PeerRegistry(self._settings.run_dir).sockets()  # they would connect within 0.5 s; we connect at once
+        siblings = PeerRegistry(self._settings.run_dir).sockets()  # we connect at once; they take up to 0.5 s
         try:
             settings = replace(self._settings, listen=tuple(filter(self._is_free, self._settings.listen)))
             rules = self._admission.rules()
@@ -140,24 +140,24 @@ class ZenohHub:
             self._session = open_session(config)
         except zenoh.ZError as error:
             raise TransportError(f"the hub cannot open {self._socket}: {error}") from None
-        Barrier(self._session, self.name, lambda: 0)  # answers the clients that wait for this hub
+        Barrier(self._session, self.name, lambda: 0)  # the session keeps it: it answers clients that wait for this hub
         worker.serve(self._session)
 
     def _is_free(self, endpoint: str) -> bool:
-        """True unless another process uses the endpoint. That is logged, or raised as TransportError.
+        """True unless another process uses the endpoint; then a hub that is no robot's raises TransportError.
 
-        A robot's hub runs without such an endpoint, because any user can take a port; other hubs end.
+        A robot's hub logs it and runs without the endpoint, because any user can take a port.
         """
         kind = socket.SOCK_DGRAM if endpoint.startswith("quic/") else socket.SOCK_STREAM
         place = endpoint.partition("/")[2].partition("#")[0].partition("?")[0]  # without protocol and options
         host, _, port = place.rpartition(":")
         try:
             family, *_, address = socket.getaddrinfo(host.strip("[]"), int(port), type=kind)[0]
-            with socket.socket(family, kind) as tried:
+            with socket.socket(family, kind) as tried:  # TCP: a port that only ended connections hold is free
                 tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, kind == socket.SOCK_STREAM)
                 tried.bind(address)
         except (ValueError, OSError) as error:
-            if not isinstance(error, OSError) or error.errno != errno.EADDRINUSE:
+            if not (isinstance(error, OSError) and error.errno == errno.EADDRINUSE):
                 return True  # Zenoh says what is wrong with it
             fact = f"transport.listen: {endpoint}: {why_not(error, int(port))}"
             if not self._settings.of_robot:

@@ -57,7 +57,7 @@ class Intake:
             self._tasks.append((task, size))
             self._bytes += size
             self._changed.notify()
-            self._room.notify()
+            self._room.notify()  # the next sender that waits: there may be room for it as well
 
     def greet(self, work: _OnQuery, query: zenoh.Query) -> None:
         """Queue a hello or goodbye, which counts as a task."""

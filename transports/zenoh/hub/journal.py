@@ -32,7 +32,7 @@ class Journal:
         self.rewrite_at = _NEVER
         self._clock = clock
         self._database: sqlite3.Connection | None = None
-        self._loaded = False  # False: its records are not known, and stay
+        self._loaded = False  # the records of the file are known; until then `rewrite` deletes none
         self._dirty, self._closing = threading.Event(), threading.Event()
         self._syncer = threading.Thread(target=self._sync, name="pebble-journal", daemon=True)
 

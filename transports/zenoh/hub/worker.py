@@ -38,10 +38,10 @@ class HubWorker:
         self, name: str, store: HubStore, admission: Admission, journal: Journal | None, counters: Counters
     ) -> None:
         self._store, self._journal, self._counters, self._admission = store, journal, counters, admission
-        self.alive_clients: set[str] = set()
+        self.alive_clients: set[str] = set()  # names of their sessions
         self._name, self._wills = name, WillTimes()
         self._has_met = False  # another hub; it was logged
-        self._token: zenoh.LivelinessToken | None = None
+        self._token: zenoh.LivelinessToken | None = None  # shows that this hub is up
         self._waiting, self._intake = WaitingQueries(), Intake()
         self._session: zenoh.Session | None = None
         self._thread = threading.Thread(target=self._run, name="pebble-hub", daemon=True)
@@ -51,9 +51,9 @@ class HubWorker:
     def serve(self, session: zenoh.Session) -> None:
         """Serve the clients of ``session``, in place of the former session, which is closed."""
         if self._session is not None:
-            self.post(self._await_return)  # its clients get time for that before their wills are published
+            self.post(self._await_return)  # its clients get time to return before their wills are published
         self._session = session
-        # REMOTE: one of the hub's own would wait for room in the queue on the thread that empties this queue.
+        # REMOTE: a message of the hub's own would wait for room in the queue on the thread that empties the queue.
         retain = direct(lambda sample: self._intake.receive(partial(self._store_retained, sample), len(sample.payload)))
         session.declare_subscriber(wire.RETAINED + "**", retain, allowed_origin=zenoh.Locality.REMOTE)
         session.declare_queryable(wire.RETAINED + "**", direct(partial(self._intake.ask, self._query)), complete=True)
@@ -86,7 +86,7 @@ class HubWorker:
             if (task := self._intake.take(self._pause())) is None:
                 return
             self._do(task)
-            for query in self._waiting.take(time.monotonic()):
+            for query in self._waiting.take(time.monotonic()):  # nothing is missing for them, or they wait no longer
                 self._intake.ask(self._answer, query)
             self._publish_due_wills()
             if self._journal is not None and time.monotonic() >= self._journal.rewrite_at:
@@ -139,17 +139,17 @@ class HubWorker:
         if "*" not in text:
             retained = self._store.get(text.removeprefix(wire.RETAINED))
             return [] if retained is None else [retained]
-        begin = text.partition("*")[0].rstrip("$/")  # rules most keys of a fleet out, quickly
+        begin = text.partition("*")[0].rstrip("$/")  # a quick choice: "$*" is a wildcard, and "a/**" matches "a"
         keyed = ((wire.RETAINED + retained.key, retained) for retained in self._store.retained())
         return [retained for key, retained in keyed if key.startswith(begin) and wanted.intersects(key)]
 
     # -- clients
 
-    def _on_hello(self, query: zenoh.Query) -> None:
+    def _on_hello(self, query: zenoh.Query) -> None:  # a client tells its will, and digests of what it retains
         with query:
             account = wire.account_of(str(query.key_expr), wire.HELLO)
             hello = self._admission.hello(account, wire.decode_hello(_payload(query)))
-            if hello is None:
+            if hello is None:  # the hub must not answer
                 return
             alive, has_will = hello.name in self.alive_clients, hello.will is not None
             self._wills.on_hello(hello.name, time.monotonic(), alive=alive, has_will=has_will)
@@ -157,7 +157,7 @@ class HubWorker:
             self.apply(StoredWill(hello.name, hello.will))
             lacking = self._store.lacks(hello)
             if lacking:
-                self._waiting.forget(hello.name)  # it sends these, and then another hello
+                self._waiting.forget(hello.name)  # the client sends these, and then another hello
             elif not account:  # no subscriber waits for what other machines retain
                 self._waiting.count_from(hello.name, hello.retained_count)
             query.reply(wire.asked(wire.HELLO, account), wire.encode(lacking))
@@ -213,7 +213,7 @@ class HubWorker:
 
     def _publish_will(self, name: str, will: wire.Will) -> None:
         key, qos = topic_to_key(will.topic), QoS(will.qos)
-        stamp = wire.Stamp(qos, 0, name)
+        stamp = wire.Stamp(qos, 0, name)  # 0: the hub made it
         if will.retain:
             self.apply(Retained(key, will.payload, stamp))
         if self._session is not None:

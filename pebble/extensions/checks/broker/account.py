@@ -33,12 +33,12 @@ def robot_account(
 ) -> Iterator[CheckResult]:
     """Publish probe messages below ``base`` and check that the broker accepts them.
 
-    No program takes a probe for anything else. ``reads``: a further filter that the broker must grant. A probe must
-    come back within ``answer_s`` with MQTT 3.1.1, which tells no refusal, or if ``reads`` is given. Above the level
-    ``open``, a probe in the name of another robot must not come back.
+    No program takes a probe for anything else. ``reads``: a further filter that the broker must grant. If it is
+    given, a probe must come back within ``answer_s``; also with MQTT 3.1.1, by which a broker cannot tell a refusal.
+    Above the level ``open``, a probe in the name of another robot must not come back.
     """
     try:
-        with reached(settings, "") as trial:
+        with reached(settings, "") as trial:  # "": no topic here is below it, as all are complete
             trial.patience_s = answer_s
             peer, topic = trial.peer(protocol=settings.protocol), BRIDGE_PROBE.topic(base)
             must_come_back = bool(reads) or settings.protocol != "5"  # before MQTT 5 no refusal is told
@@ -49,7 +49,7 @@ def robot_account(
             if level != "open":
                 yield _rules(what, trial, peer, topic)
             if trial.round_trip_s >= _MATTERS_S:
-                result = trial.judge(lambda trial: held_back(trial, peer, peer, topic))
+                result = trial.judge(lambda trial: held_back(trial, peer, peer, topic))  # it reads what it writes
                 yield replace(result, what=f"small messages at {what}")
     except TransportError as error:
         yield warn(f"cannot be published to: {error}", what=what)
@@ -107,7 +107,7 @@ def _rules(what: str, trial: BrokerTrial, peer: Peer, topic: str) -> CheckResult
     mid = peer.publish(other, payload, qos=1)
     is_back, _ = _echo(trial, peer, topic)  # sent later: if the first one was let through, it came before this
     if payload in peer.payloads():
-        fix = "start it with the files of `pebble fleet init`, see docs/ext/fleet.md"
+        fix = "start it with the files of `pebble fleet init FOLDER --host NAME`, see docs/ext/fleet.md"
         return failed("has no rules: with this account one can pose as any robot, and drive it", fix, what)
     code = peer.acks.get(mid, 0)
     if code >= REFUSED and not reasons.concerns_login(code):

@@ -12,6 +12,7 @@ from pebble.extensions.checks.broker import MOSQUITTO
 from pebble.extensions.checks.broker.login_attempt import TIMEOUT_S, LoginAttempt, attempt
 from pebble.extensions.checks.check import SOON_DAYS
 from pebble.extensions.checks.machine import printed
+from pebble.extensions.operator.places import mosquitto_path
 from pebble.transports.settings import MqttSettings
 
 _REFUSED_ID = 2  # a return code of CONNACK (MQTT 3.1.1, table 3.1)
@@ -29,7 +30,11 @@ def broker(
     what, is_here = f"{name} {settings.host}:{settings.port}", is_loopback(settings.host)
     answer = attempt(settings, login=True, timeout_s=answer_s)
     if answer.code is None:
-        start = "sudo systemctl start mosquitto" if is_here else f"nc -vz {settings.host} {settings.port}"
+        start = "sudo systemctl start mosquitto"
+        if not is_here:
+            start = f"on {settings.host}: {start}; or correct the address {settings.host}:{settings.port}"
+        elif mosquitto_path() is None:
+            start = "sudo apt install mosquitto"
         yield failed(f"cannot be reached: {answer.problem}", start, what)
         return
     yield replace(_own_login(settings, answer), what=what)

@@ -168,8 +168,11 @@ def held_back(trial: BrokerTrial, reader: Peer, writer: Peer, topic: str) -> Che
 
 
 def _pair(trial: BrokerTrial, reader: Peer, writer: Peer, topic: str) -> tuple[float, float] | None:
-    """Return a message's round trip, and how much longer the next message takes; None if either is lost."""
-    reader.acknowledge_late()  # a quick one would hide the delay
+    """Return a message's round trip, and how much longer the next message takes; None if either is lost.
+
+    The next one takes longer if the broker holds it back until the first one is acknowledged.
+    """
+    reader.acknowledge_late()  # after a quick acknowledgement nothing would be held back
     sent, probes = list[float](), [new_probe(number) for number in range(2)]
     for probe in probes:
         sent.append(time.monotonic())
@@ -190,7 +193,7 @@ def pings(trial: BrokerTrial) -> CheckResult:
     if not peer.ping():
         return failed("it does not answer a ping", "use another broker: robots would connect anew all the time")
     seconds = time.monotonic() - began
-    overtaken = max(_overtaken(trial, peer) for _ in range(_PING_TRIES))
+    overtaken = max(_overtaken(trial, peer) for _ in range(_PING_TRIES))  # of 20 messages in each try
     if seconds > _PING_S:
         trial.late = True
         return failed(f"it takes {seconds:.1f} s for one", "use a broker that is nearer, or less busy")

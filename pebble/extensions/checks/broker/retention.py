@@ -8,7 +8,7 @@ from pebble.extensions.checks.broker.peer import BrokerTrial, Peer, RefusedError
 
 _STATES = 200  # retained ones; a robot has some twenty
 _TRIES = 6  # to get the retained message after a restart
-_BY_NAME = 8  # filters in one SUBSCRIBE: AWS IoT closes the connection for more
+_MOST_FILTERS = 8  # filters in one SUBSCRIBE: AWS IoT closes the connection for more
 _PERSISTENT = f"{MOSQUITTO}persistence true, persistence_location /var/lib/mosquitto/, autosave_on_changes true"
 
 
@@ -49,8 +49,8 @@ def by_wildcard(trial: BrokerTrial) -> CheckResult:
 def before_pong(trial: BrokerTrial) -> CheckResult:
     """Check that retained messages come before the answer to a ping that was sent after the subscription."""
     names, reader = _retain_states(trial), trial.peer()
-    expected = len(names) if trial.wildcards else _BY_NAME
-    filters = ["#"] if trial.wildcards else names[:expected]
+    expected = len(names) if trial.wildcards else _MOST_FILTERS
+    filters = ["#"] if trial.wildcards else names[:expected]  # by name, as many as one SUBSCRIBE may have
     reader.subscribe(*filters, qos=0)
     reader.ping()
     trial.wait(lambda: len(reader.received) >= expected)

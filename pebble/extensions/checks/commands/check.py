@@ -66,7 +66,7 @@ def check(
 
 
 def _check(path: Path, *, as_json: bool, first: bool) -> bool:
-    """Print a config's summary or its problems; return False if it has problems. The schema is passed over."""
+    """Print a config's summary or its problems; return False if it has problems. schema.json is skipped."""
     if path.name == SCHEMA:
         typer.echo(f"pebble: {path.name}: the JSON Schema of configs, not a config", err=True)
         return True
@@ -220,7 +220,7 @@ def topics_of(config: Config) -> Iterator[tuple[str, list[TopicLine]]]:
 
 
 def _lines(config: Config, service: str) -> list[TopicLine]:
-    """Return the topics of a service's process: those that a key may rename, and one that is never renamed, if any."""
+    """Return the topics of a service's process: those with a key that may rename them, and one without, if any."""
     addresses = Addresses(config)
     channels = [channel for channel in CHANNELS if _is_of(channel, service) or channel is _NEVER_RENAMED.get(service)]
     if service == "serial_mcu_bridge":
@@ -277,8 +277,8 @@ def _scripts(config: Config) -> list[tuple[str, str]]:
 def _shared_broker(config: Config) -> Mqtt | None:
     """Return the broker that other programs, too, may use to reach the robot's own processes; None if there is none.
 
-    With Zenoh inside it is that of the mirror. With MQTT it is the local one, if operators use that as well; without
-    a bridge in any case.
+    With Zenoh inside it is that of the mirror. With MQTT inside it is the local one if operators use it, too: there
+    is no bridge, or it does not lead to another broker or to a hub.
     """
     if config.transport.kind != "mqtt":
         return config.transport.mqtt_mirror

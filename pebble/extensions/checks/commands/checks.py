@@ -36,7 +36,10 @@ class Printer:
         self._config, self._as_json = shlex.quote(config), as_json
 
     def take(self, result: CheckResult, why: str = "") -> None:
-        """Print a result. Texts may come from the robot, so secrets and control characters are masked."""
+        """Print a result; after a bad one also ``why``: what goes wrong for people because of it.
+
+        Texts may come from the robot, so secrets and control characters are masked.
+        """
         text = shown(without_secrets(result.text))
         fix = shown(without_secrets(result.fix.replace("CONFIG", self._config)))
         row = {"name": shown(result.what), "state": result.state.value, "text": text, "fix": fix}

@@ -56,7 +56,8 @@ def doctor(
 ) -> int:
     """Check that this machine is ready for the robot, or with --broker that a broker is fit for robots.
 
-    Each problem is printed with the command that fixes it. Exits 1 if a check fails, but not for warnings.
+    Each problem is printed with a command that ends it, or with what to change or to look at. Exits 1 if a check fails,
+    but not for warnings.
 
     With --running the robot is tested, end to end: on its own machine, as its user or root. Without --may-move no
     wheel turns. The robot is stopped for a moment, by an emergency stop that is ended by its name; not while a person

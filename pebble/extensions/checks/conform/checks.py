@@ -84,7 +84,7 @@ def heartbeat(robot: Observer) -> CheckResult:
     interval = robot.view.liveness.interval_s
     if len(gaps) < 2 or interval is None:
         return failed(f"{len(beats)} in the time of observation", "publish one at least every second")
-    longest = silent_after(interval, robot.view.liveness.link, 0.0)
+    longest = silent_after(interval, robot.view.liveness.link, 0.0)  # 0.0: nothing for delays on the way
     if max(gaps) > longest:
         return failed(f"a gap of {max(gaps):.1f} s, where {longest:.1f} s counts as silence", "publish them evenly")
     if interval > _SLOWEST_S and robot.view.liveness.link == "wide":
@@ -142,6 +142,7 @@ def sizes(robot: Observer) -> CheckResult:
 
 
 def retained(robot: Observer) -> CheckResult:
+    """Check that the channels of states are published with the retain flag, and no others."""
     retained_metrics = {record.metric for record in robot.retained()}
     lacking, stale = set(), set()
     for record in robot.records:

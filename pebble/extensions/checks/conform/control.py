@@ -43,11 +43,11 @@ class Driver:
         return self._robot.answers(lambda: not self.holds)
 
     def takes(self) -> float:
-        """Take control from its present holder; return the time (monotonic)."""
+        """Take control from its present holder; return the time of the request (monotonic)."""
         return self._robot.send(c.CONTROL_TAKE, self.request())
 
     def send(self, z: object = 0, *, key: str | None = None, wrapped: bool = False, **fields: object) -> float:
-        """Send one command; return the time (monotonic). ``key`` replaces its own key; "" sends none.
+        """Send one command; return the time of sending (monotonic). ``key`` replaces its own key; "" sends none.
 
         ``wrapped``: within ``{"value": …}``, which robots accept, too.
         """

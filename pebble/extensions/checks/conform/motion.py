@@ -73,7 +73,7 @@ def _swings(readings: list[tuple[float, Any]]) -> Iterator[float]:
 
 
 def _wheel_reports(robot: Observer) -> list[tuple[float, list[float]]]:
-    """Return the wheel speeds, each with its time: those that ``robot.eyes`` saw; if it saw none, the reported ones."""
+    """Return the wheel speeds, each with its time: as seen from outside (``robot.eyes``), or else as reported."""
     reports = [(report.at, report.value.value.get("wheels")) for report in robot.of(c.STATUS) if report.value]
     return robot.eyes() or [(at, wheels) for at, wheels in reports if _are_speeds(wheels)]
 
@@ -85,7 +85,7 @@ def _odometry_wheels(robot: Observer) -> list[tuple[float, list[float]]]:
         value: dict[str, Any] = record.value.value if record.value else {}
         linear: Any = value.get("linear_speed_mps")
         angular: Any = value.get("angular_speed_radps")
-        if _are_speeds([linear, angular]):
+        if _are_speeds([linear, angular]):  # rounded, so that less than 5 mm/s counts as rest
             ahead_mps, turn_mps = round(float(linear), 2), _HALF_TRACK_M * round(float(angular), 2)
             speeds.append((record.at, [ahead_mps - turn_mps, ahead_mps + turn_mps]))
     return speeds
@@ -101,7 +101,7 @@ def _moving_wheels(robot: Observer, since: float) -> list[float] | None:
         return next((wheels for at, wheels in reversed(reports()) if at >= since and any(wheels)), [])
 
     robot.wait(newest_moving, ANSWER_S)
-    robot.look(LATE_S)
+    robot.look(LATE_S)  # more reports may follow, and the newest counts
     return newest_moving() if reports() else None
 
 
@@ -199,7 +199,8 @@ def _steering(robot: Observer, driver: Driver) -> CheckResult:
         wheels = _moving_wheels(robot, began)
         if wheels is None:
             return _NOT_SHOWN
-        if [speed * sign > 0 for speed, sign in zip(wheels, signs, strict=False)] != [True, True]:
+        are_right = len(wheels) > 1 and all(speed * sign > 0 for speed, sign in zip(wheels, signs, strict=False))
+        if not are_right:
             sent = f"x {fields.get('x', 0):g}, z {fields['z']:g}"
             if "wrapped" in fields:
                 sent += " within value"
@@ -245,6 +246,7 @@ def _not_a_number(robot: Observer, _driver: Driver) -> CheckResult:
 
 
 def _clamped(robot: Observer, driver: Driver) -> CheckResult:
+    """Check that no wheel gets more than full power by axes beyond -1..1."""
     began, _ = driver.drive(DRIVES_S / 2, z=9, x=-9)
     wheels = _moving_wheels(robot, began)
     if wheels is None or not _wheel_reports(robot):  # speeds by odometry are good for their signs only

@@ -133,7 +133,7 @@ def _status(here: Here) -> str:
         raise PebbleError("the config cannot be read")
     user, file = user_of(here.config.run_dir()), str(here.file.absolute())
     options: dict[str, Any] = {}
-    if user is not None:  # this user sees the variables of the process: it gets only these
+    if user is not None:  # a user sees the variables of their processes: this one gets only these
         env = {name: os.environ[name] for name in (*_VARIABLES, *here.config.password_variables) if name in os.environ}
         options = {"user": user.pw_uid, "group": user.pw_gid, "extra_groups": [], "env": env}
     topics = f"{here.config.base}/{OUTGOING}/#"

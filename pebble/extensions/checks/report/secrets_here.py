@@ -92,6 +92,7 @@ def values_in(name: str, raw: bytes) -> Iterator[str]:
         value = next(filter(None, match), "").strip()
         if value.lower() not in _NOTHING:
             yield from {value, _decoded(value)}
+    # A file such as `mqtt-password`, in which each line is a secret: neither of keys nor JSON, which are read above.
     if _names_secrets(name) and "-----BEGIN" not in text and not text.lstrip().startswith("{"):
         for line in filter(None, map(str.strip, text.splitlines())):
             _, colon, hashed = line.partition(":$")

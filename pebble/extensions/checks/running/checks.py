@@ -61,7 +61,7 @@ def free(robot: RobotUnderTest) -> str:
 
 def processes(robot: RobotUnderTest) -> CheckResult:
     """Check that the robot answers on its own transport, and that each of its processes is ready."""
-    if why := robot.why_own or running(robot):
+    if why := robot.why_own or running(robot):  # why_own: its own transport could not be reached
         return failed(why, "sudo systemctl start pebble, or pebble up CONFIG; and test it as the robot's user or root")
     if not robot.wait(lambda: _unready(robot) == [], robot.patience_s):
         return failed(", ".join(_unready(robot)), _LOG)
@@ -156,7 +156,7 @@ def boards(robot: RobotUnderTest) -> CheckResult:
     if names := absent():
         mcu = _mcu(robot, names[0])
         why = mcu.get("why") or _MCU_STATES.get(str(mcu.get("state")), "its state is not known")
-        return failed(f"{names[0]} ({lines[names[0]]}): {why}", f"plug it in, then: ls -l /dev/serial/by-id/; {_LOG}")
+        return failed(f"{names[0]} ({lines[names[0]]}): {why}", f"plug it in, then: pebble doctor CONFIG; {_LOG}")
     robot.wait(lambda: robot.view.driveable is None or robot.view.driveable.state != "unknown", _JUDGED_S)
     mcus = {name: _mcu(robot, name) for name in lines}
     restarting = [f"{name}: {mcu.get('why')}" for name, mcu in mcus.items() if _is_often(mcu, "starts")]

@@ -152,5 +152,5 @@ def _trusting(certificate: Path | None) -> tuple[ssl.SSLContext | None, float | 
         return None, None
     context = ssl.create_default_context(cafile=str(certificate))
     context.check_hostname = False
-    context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN
+    context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN  # this one is enough, not only that of an authority
     return context, certificates.show(certificate).days_left

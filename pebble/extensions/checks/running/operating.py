@@ -11,6 +11,7 @@ from pebble.errors import PebbleError
 from pebble.extensions.checks.conform.control import Driver
 from pebble.extensions.checks.conform.motion import LATE_S, at_the_wheel, rested
 from pebble.extensions.checks.running.robot import RobotUnderTest
+from pebble.extensions.operator.client.driveable import doubt_of, is_cut_off
 from pebble.extensions.operator.client.estop import StopSender, new_name, send
 from pebble.extensions.operator.client.estop_states import Reset
 from pebble.extensions.operator.client.media_receiver import MediaReceiver
@@ -66,7 +67,7 @@ def received(robot: RobotUnderTest, medium: Medium, device: str) -> CheckResult:
 
 def stop(robot: RobotUnderTest) -> CheckResult:
     """Check that an operator's stop is confirmed; then end exactly this stop from the robot's own side."""
-    before = {owner: state.recent for owner, state in robot.view.estop.states.items()}
+    before = {owner: state.recent for owner, state in robot.view.estop.states.items()}  # names of the newest stops
     side, name = robot.commanding_side, new_name()
     sender = StopSender(name, by=robot.by, why=_WHY, now=time.monotonic(), robots=[robot.config.base])
     stopped = sender.robots[robot.config.base]
@@ -87,12 +88,14 @@ def stop(robot: RobotUnderTest) -> CheckResult:
     if took_s is None:
         text = f"NOT CONFIRMED after {_CONFIRMED_S:g} s: {why}"
         return failed(text, "pebble doctor CONFIG; pebble estop CONFIG")
+    if is_cut_off(robot.view.driveable):  # it confirms, and says itself that nothing reaches the motors
+        return failed(f"{robot.view.name} is latched; {doubt_of(robot.view.driveable, stopped=True)}", _LOG)
     sender_side = "its own side" if side.own else "operators"
     return ok(f"confirmed {took_s:.2f} s after {sender_side} sent it, and ended by name")
 
 
 def _end(robot: RobotUnderTest, name: str, before: dict[str, list[str]]) -> str:
-    """End this stop, but none newer than ``before``, each owner's known stops; return why the robot stays stopped."""
+    """End this stop, unless stops came that are not in ``before`` (by owner); return why the robot stays stopped."""
     view = robot.view
     robot.wait(lambda: all(name in state.recent for state in view.estop.states.values()), 1.0)
     if not view.latched:

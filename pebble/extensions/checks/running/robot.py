@@ -42,7 +42,7 @@ class RobotSide(Observer):
         super().__init__(target, transport, names, [self._addresses[channel].topic for channel in watched])
 
     def is_here(self, config: Config) -> bool:
-        """True if this side is on this machine. Retained messages of silent robots there may be from earlier names."""
+        """True if this side is on this machine. Then retained messages of other ids may be from before a rename."""
         if self.own:
             return config.transport.kind != "mqtt" or is_loopback(config.local_mqtt.host)
         return is_loopback(config.services.mqtt_bridge.remote_mqtt.host)

@@ -2,6 +2,7 @@
 
 import json
 import time
+from operator import itemgetter
 from typing import Annotated, Any
 
 import typer
@@ -35,21 +36,21 @@ def audit(
     except OSError as error:
         raise PebbleError(f"{error.filename}: {error.strerror}; run it as the robot's user") from None
     lines = [line for line in content.splitlines() if line]
-    rows = [row for row in map(_row, lines[-limit:]) if row]
-    print_table(("time", "what", "who", "from", ""), rows)
+    rows = sorted((row for row in map(_row, lines[-limit:]) if row), key=itemgetter(0))  # by time: × is stored late
+    print_table(("time", "what", "who", "from", ""), [columns for _, columns in rows])
     typer.echo(f"{newer}: {len(lines):,} rows" if lines else "nothing yet: the bridge of this robot writes it")
     if unread := min(limit, len(lines)) - len(rows):
         typer.echo(f"{unread:,} lines cannot be read: a power cut leaves such, or somebody has changed them")
     return 0
 
 
-def _row(line: bytes) -> tuple[str, ...]:
-    """Return the columns of a line of the log; empty if it cannot be read."""
+def _row(line: bytes) -> tuple[float, tuple[str, ...]] | None:
+    """Return the time and the columns of a line of the log; None if it cannot be read."""
     try:
         row: dict[str, Any] = json.loads(line)
         at = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(row["t"]))
     except (ValueError, LookupError, TypeError, ArithmeticError, OSError, RecursionError):
-        return ()
+        return None
     what, who, place, count = (str(row.get(column, "")) for column in _COLUMNS[1:])
     more = ", ".join(f"{key} {value}" for key, value in row.items() if key not in _COLUMNS and value != "")
-    return at, f"{what} × {count}" if count else what, who, place, more
+    return row["t"], (at, f"{what} × {count}" if count else what, who, place, more)

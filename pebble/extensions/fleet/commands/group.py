@@ -166,7 +166,7 @@ def role_(
         after = replace(fleet, accounts={**fleet.accounts, name: changed})
         how = applying.apply(place, after)
     typer.echo(f"{name} is {', '.join(changed.roles)} now ({how})")
-    return _print_left(_copies(place, after))
+    return _print_left(_copies(place, after))  # 1 if somebody must copy the new rules to a broker or hub elsewhere
 
 
 def password(name: _Name, folder_: _Folder = None) -> int:
@@ -315,6 +315,7 @@ def register(app: typer.Typer) -> None:
 
 
 def _init_again(place: Path, host: str | None, level: str | None, plain: bool | None) -> int:
+    """Change the level of a fleet that exists, and whether its topics are plain; None leaves either as it is."""
     if host is not None:
         raise PebbleError(f"{_shown(place)} is a fleet already, so leave out --host; another host needs another folder")
     with _locked_fleet(place) as (_, fleet):
@@ -368,6 +369,7 @@ def _account(place: Path, fleet: Fleet, name: str) -> Account:
 
 
 def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, *, board: bool = False) -> None:
+    """Print how an account logs in, and what uses it; ``how``: what `applying.apply` has done to admit it."""
     account = fleet.accounts[name]
     if ProgramRole.NEIGHBOUR in account.roles:  # it logs in nowhere: its certificate admits it to the hub
         typer.echo(f"{name} is {account.bases[0]} at the hub of a LAN ({how}).")

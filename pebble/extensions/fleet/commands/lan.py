@@ -1,6 +1,6 @@
 """``pebble fleet lan`` and ``pebble fleet up``: where the robots of a LAN meet, from its files to its programs.
 
-At its hub each robot and each board is a *neighbour* of the others, which they may receive from.
+Each robot and each board is a *neighbour* at the hub of the LAN: it may receive messages of the others.
 """
 
 from __future__ import annotations
@@ -182,9 +182,9 @@ def _write_boards(place: Path, fleet: Fleet, boards: list[str], passwords: dict[
         piece = pieces.of_broker(fleet, name, passwords[name], board=True)
         piece["robot"]["platform"] = "esp32"
         _write(_folder_of(place, name) / f"{name}.json", piece)
-    gateway = pieces.boards_file(fleet, GATEWAY, "")
+    gateway = pieces.boards_file(fleet, GATEWAY, "")  # "": the certificates are in the file's own folder
     for neighbour in gateway["neighbours"].values():
-        neighbour["shares"] = list(_SHARED)
+        neighbour["shares"] = list(_SHARED)  # the metrics that others receive of this board
     _write(place / GATEWAY_FILE, gateway)
     write(place / f"{GATEWAY}-password", f"{passwords[GATEWAY]}\n".encode(), 0o600, FleetError)
 

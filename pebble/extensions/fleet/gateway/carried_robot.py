@@ -34,10 +34,13 @@ LARGEST = 1024 * 1024  # bytes of a message; the brokers of `pebble fleet` take 
 
 
 class NamedSubjects(Subjects):
-    """A robot's subjects without renamed topics, but with the topics that have an account's name."""
+    """The meaning of a robot's topics, its *subjects*: by the contract's names, also with the sender's account in them.
+
+    Topics that the robot's own config renames are not known here.
+    """
 
     def _find(self, topic: str) -> Subject | None:
-        """Return the subject of a topic. A topic with an account's name has that of the same topic without the name."""
+        """Return the subject of a topic. For a topic with an account's name, look up the topic without the name."""
         if not topic.startswith(f"{self._base}/{INCOMING}/{BY}/"):
             return super()._find(topic)
         named = without_name(topic)
@@ -113,8 +116,8 @@ def _subscribe(robots: Sequence["CarriedRobot"], side: Side, transport: Transpor
 class CarriedRobot:
     """A robot of the hub for which the gateway forwards.
 
-    ``stops_pass()``: True if another connection carries stops; called for each stop. ``too_large``: called with the
-    topic of a message that is too large for any broker.
+    ``stops_pass()``: True if stops pass by another connection, so that this forwarder leaves them out; called for each
+    stop. ``too_large``: called with the topic of a message that is too large for any broker.
     """
 
     def __init__(

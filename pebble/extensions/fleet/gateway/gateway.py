@@ -178,7 +178,7 @@ class Gateway:
                     "robots of a LAN"
                 )
             self._quiet_log.warning(base, "gateway %s carries %s: this one leaves it", other, base)
-            self._end(self.carries & {base})
+            self._end(self.carries & {base})  # it may be heard, but not carried
 
     def _begin(self, now: float) -> None:
         """Begin to carry robots that were heard and that no gateway carries, at most TOGETHER of them."""
@@ -221,25 +221,27 @@ class Gateway:
         self._listens_since = self._clock() if state is State.CONNECTED else float("inf")
 
     def _on_robot(self, message: Message) -> None:
+        """Note a live heartbeat of a robot."""
         address, payload = parse_topic(message.topic), message.payload
         if not payload or address is None or address.identity.is_server:
             return
         base = address.identity.base
-        may_be_old = message.retain  # with ``as_published`` live heartbeats are marked so, too
-        if may_be_old and not (self._hub.as_published and self._differs(base, payload)):
-            return
+        if message.retain:
+            may_be_live = self._hub.as_published  # then a live heartbeat has the flag, too, as it was published with it
+            if not (may_be_live and self._differs_from_first(base, payload)):
+                return
         if base in self._heard or len(self._heard) < MAX_ROBOTS:
             self._heard[base] = self._clock()
         else:
             self._quiet_log.warning("many", "the hub has more than %d robots: give it accounts", MAX_ROBOTS)
 
-    def _differs(self, base: str, heartbeat: bytes) -> bool:
-        """True if the robot's first heartbeat was a different one, so that this one is live.
+    def _differs_from_first(self, base: str, heartbeat: bytes) -> bool:
+        """True if the robot's first heartbeat was a different one, so that this one is live. Stores the first one.
 
         Needed where a transport cannot tell live messages from retained ones.
         """
         if base not in self._first and len(self._first) >= MAX_ROBOTS:
-            self._first.clear()
+            self._first.clear()  # costs a robot one heartbeat
         return self._first.setdefault(base, heartbeat) != heartbeat
 
     def _on_gateway(self, message: Message) -> None:

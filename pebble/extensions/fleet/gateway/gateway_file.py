@@ -47,7 +47,10 @@ class GatewayFile(Section, frozen=True, kw_only=True):
 
     @property
     def operators(self) -> Mqtt | None:
-        """Return the settings of the operators' broker; None if this gateway only serves neighbours."""
+        """Return the settings of the operators' broker; None if no robot is carried to one.
+
+        That is a gateway which only lets robots of the LAN hear and drive the boards in ``neighbours``.
+        """
         return self.mqtt or (None if self.neighbours else Mqtt())
 
 
@@ -91,7 +94,7 @@ def _check_sides(notes: Notes, gateway: GatewayFile, operators: Mqtt | None) -> 
 
 
 def _check_neighbours(notes: Notes, gateway: GatewayFile) -> None:
-    """Note mistakes in ``neighbours``: for each board, what services.neighbours is for a robot with programs."""
+    """Note mistakes in ``neighbours``: it does for each board what services.neighbours does in a robot's own config."""
     if gateway.neighbours and gateway.boards is None:
         notes.problem(("neighbours",), "must be left out without boards: a robot at a hub has its own")
     if len(gateway.neighbours) > MOST_BOARDS:

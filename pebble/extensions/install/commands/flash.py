@@ -73,7 +73,8 @@ def flash(
     if config is not None and target.has_wifi:
         for warning in config.warnings:
             typer.echo(f"warning: {warning}", err=True)
-    withhold((WIFI_PASSWORD, *(() if config is None else config.password_variables)))
+    password_variables = () if config is None else config.password_variables
+    withhold((WIFI_PASSWORD, *password_variables))
     if dry_run:
         show_steps(options, Tools(), typer.echo)
         return 0

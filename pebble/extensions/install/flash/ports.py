@@ -19,7 +19,10 @@ _RESET_PULSE_S = 0.1
 
 
 def described() -> list[str]:
-    """Return a line per serial port: its path, the USB device's own name, and its ids."""
+    """Return a line per serial port: its path, the USB device's own name, and its ids.
+
+    A port that has neither a USB device nor a name is left out.
+    """
     lines = []
     for port in sorted(list_ports.comports()):
         name = " ".join(filter(None, (port.manufacturer, port.product))) or port.description

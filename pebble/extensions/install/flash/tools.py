@@ -35,7 +35,7 @@ class Tools:
             name: (sys.executable, "-Pm", module) for name, module in _MODULES.items()
         }
         self._programs = defaults | (programs or {})
-        self._given = set(programs or {})
+        self._given = set(programs or {})  # the tools that ``programs`` replaces
 
     def check(self, names: Sequence[str]) -> None:
         """Raise PebbleError, with the install command, if one of ``names`` is missing."""
@@ -47,9 +47,9 @@ class Tools:
         """Return the tool's output. Raises PebbleError with its last lines if it fails. Commands contain no secrets."""
         line = [*self._programs[command.tool], *command.arguments]
         try:
-            if command.loud:
-                quiet = subprocess.DEVNULL
-                done = Finished(subprocess.run(line, stdin=quiet, timeout=timeout_s, check=False).returncode, "", "")
+            if command.loud:  # its output goes directly to the user
+                result = subprocess.run(line, stdin=subprocess.DEVNULL, timeout=timeout_s, check=False)
+                done = Finished(result.returncode, "", "")
             else:
                 done = run(line, timeout_s, stderr=subprocess.STDOUT)
         except subprocess.TimeoutExpired:

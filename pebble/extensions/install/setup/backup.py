@@ -222,7 +222,7 @@ def unpacked(raw: bytes, name: str) -> Backup:
             if len(rest) < _END or rest.strip(b"\0"):  # tarfile takes a damaged header for the end
                 raise EOFError("its end is missing")
     except (tarfile.TarError, EOFError, ValueError) as error:
-        if not raw.startswith(ABOUT.encode()):
+        if not raw.startswith(ABOUT.encode()):  # a tar file begins with the name of its first member
             raise BackupError(f"{name}: is no backup of Pebble") from None
         raise BackupError(f"{name}: is cut off or damaged: {error}; make another backup, or use an older one") from None
     return backup

@@ -66,7 +66,7 @@ def restore(system: System, file: Path, agree: Callable[[Sequence[str]], None]) 
         target = places.root / name
         for folder in reversed(target.parents):
             if not folder.exists():
-                # By the slash a folder of _PLACES counts as below itself.
+                # With the slash `_place` finds the entry of a folder that is itself in _PLACES, too.
                 owner, mode = _PLACES.get(_place(f"{folder.relative_to(places.root)}/"), _SHARED)
                 system.make_folder(folder, mode, owner)
         if not places.unfinished.exists() and places.etc.is_dir():
@@ -91,9 +91,9 @@ def _content(file: Path) -> bytes:
 
 
 def _allowed(files: dict[str, Saved], places: Places) -> dict[str, Saved]:
-    """Return the files to restore. Of mosquitto's files only those of the broker's folder are among them, but no links.
+    """Return the files to restore: of those in /etc/mosquitto only the broker's folder, without its links.
 
-    Links, and the configuration that mosquitto includes, are made anew, as the backup may have been changed.
+    These links, and the configuration that mosquitto includes, are made anew, as the backup may have been changed.
     """
     folder = f"{places.broker_folder.relative_to(places.root)}/"
     links = [f"{folder}{name}" for name in own_broker.LINKS]
@@ -111,7 +111,7 @@ def _allowed(files: dict[str, Saved], places: Places) -> dict[str, Saved]:
 
 
 def _foreign(value: Any, *keys: str) -> Iterator[str]:
-    """Yield a config's programs that setup never writes, and its files that are not the robot's, with their keys."""
+    """Yield ``KEY: VALUE`` for each program that setup never puts into a config, and each file not the robot's."""
     key = keys[-1] if keys else ""
     is_run = key in _RUNS or key.endswith(("_command", "_env"))
     is_other_program = is_run and value and value not in COMMANDS

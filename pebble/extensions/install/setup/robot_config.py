@@ -65,7 +65,7 @@ def changed(current: dict[str, Any], before: dict[str, Any], after: dict[str, An
             result[key] = changed(present, old or {}, new or {})
         elif key in after:
             result[key] = new
-        elif present == old:
+        elif present == old:  # setup writes it no longer, and no person has changed it
             result.pop(key, None)
     return result
 
@@ -82,11 +82,12 @@ def config_of(answers: Answers, places: Places) -> dict[str, Any]:
         line = {"port": answers.port, "baud": answers.speed}
         services["serial_mcu_bridge"] = {"enabled": True, "protocol": answers.protocol, "serial": line}
     if answers.broker != NONE:
+        reboot, restart, _update = COMMANDS
         services["mqtt_bridge"] = {
             "enabled": True,
             "remote_mqtt": _broker(answers),
-            "reboot_control": {"command": COMMANDS[0]},
-            "service_restart_control": {"command": COMMANDS[1]},
+            "reboot_control": {"command": reboot},
+            "service_restart_control": {"command": restart},
         }
     config: dict[str, Any] = {
         "//": "Written by `pebble setup`. What is changed here by hand stays; `pebble check --keys` lists all keys.",

@@ -115,7 +115,7 @@ class Job:
         """Raise AnswersError with the keys that still need an answer."""
         answers, secrets = self.answers, self.secrets
         is_known = answers.user is not None and has_user(self.people, answers.user)
-        is_there = {
+        is_settled = {  # given, or not needed
             "id": answers.id is not None,
             "port": answers.port is not None,
             "protocol": answers.protocol is not None or answers.port in (None, NONE),
@@ -127,7 +127,7 @@ class Job:
             "user": answers.user is not None or not self.needs_user,
             "password_file": secrets.password is not None or not self.needs_user or is_known,
         }
-        if missing := [key for key, has_answer in is_there.items() if not has_answer]:
+        if missing := [key for key, settled in is_settled.items() if not settled]:
             raise AnswersError("\n".join(f"{key} is missing: {KEYS[key]}" for key in missing))
 
     # -- the steps
@@ -150,6 +150,7 @@ class Job:
             yield self._file("password of the robot at its broker", file, f"{typed}\n".encode())
         if self.answers.broker == HERE:
             # Without a config the file is of an unfinished setup; with one, it may be of the broker before this one.
+            # The page's file is of this broker only.
             keeps_password = self.config is None or self.has_login
             yield self._new_password("password of the robot at its own broker", file, known=keeps_password)
             if self.answers.page:
@@ -200,6 +201,7 @@ class Job:
         """Yield the steps that end the robot's own broker, and write the certificate of another broker's authority."""
         broker_conf = self.places.broker
         if broker_conf.exists():
+            # False: it is not done yet, as the file exists.
             yield Step("the robot's own broker ends", lambda: False, broker_conf.unlink, (BROKER_SERVICE,))
         if self.answers.broker_ca in (None, self.earlier.broker_ca):
             return

@@ -6,7 +6,7 @@ the operator's publish call to the last byte of the command's line at the MCU's 
 the operator. Under ``commands`` robots forward no reports. CPU is that of the process that bridges and of the one that
 owns the serial line, for each command and report that they forwarded. Each round starts fresh robots. They
 are driven in turns of a second, one after another; every other time in reverse order. Commands and reports that take
-longer than a second are lost, and commands that a newer one overtook.
+longer than a second count as lost, and so do commands that a newer one overtook.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def running(variants: Sequence[str], *, reports: bool) -> Iterator[dict[str, Dri
         driven = {kind: stack.enter_context(driven_robot(kind, reports=reports)) for kind in variants}
         for robot in driven.values():
             robot.wait_until_ready()
-        time.sleep(STARTUP_S)
+        time.sleep(STARTUP_S)  # a service that is ready may still have work of its start
         yield driven
 
 
@@ -138,6 +138,7 @@ def cpu_table(results: Results, cells: Sequence[Cell]) -> Table:
     """Return the CPU time for each forwarded message."""
     grid = plain_table("CPU for each forwarded message, µs: median (minimum to maximum) of the rounds",
                         ["load", "process", "variant", "", f"to {STAND_IN}"], left=3, caption=RATIOS)  # fmt: skip
+    # by all parameters, which cells_of gives in this order
     for (load, process), group in grouped(cells, lambda cell: tuple(cell.params.values())).items():
         for ours in group:
             base = results.find(STAND_IN, CPU, load=load, process=process)

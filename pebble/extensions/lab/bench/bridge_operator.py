@@ -122,12 +122,12 @@ class DrivenRobot(StockClient):
     def drive(self, seconds: float) -> Turn:
         """Drive at a steady rate. Raises PebbleError if one of the two bridges has ended."""
         before = {part: cpu_s([pid]) for part, pid in self._pids.items()}
-        sent: dict[Wheels, int] = {}
+        sent: dict[Wheels, int] = {}  # see Turn: no two commands have the same speeds
         began = time.monotonic_ns()
         for _ in paced(seconds):
             self._number += 1
             speeds = wheels(self._number)
-            sent[speeds] = round(1e9 * self._driver.command(drive_of(*speeds)))
+            sent[speeds] = round(1e9 * self._driver.command(drive_of(*speeds)))  # it returns when it has sent, in s
         ended = time.monotonic_ns()
         used = {part: cpu_s([pid]) - before[part] for part, pid in self._pids.items()}
         if min(used.values()) <= 0:  # the CPU time of a process that has ended is 0
@@ -155,7 +155,7 @@ class DrivenRobot(StockClient):
 
 
 class StandIn(Robot):
-    """A robot as a user would build it without us."""
+    """A robot as a user would build it without Pebble."""
 
     def launch(self) -> None:
         reports = ["--reports"] if self.reports else []

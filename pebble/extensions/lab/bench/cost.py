@@ -115,6 +115,7 @@ def table(results: Results) -> Table:
                 for variant in KINDS
             )
             comparisons = map(compared, zenoh, mqtt)
-            shown_phase, style = "" if number else str(phase), "bold" if process == ALL else None
+            shown_phase = str(phase) if number == 0 else ""  # once for all its processes
+            style = "bold" if process == ALL else None
             grid.add_row(shown_phase, process, *map(middle, (*mqtt, *zenoh)), *comparisons, style=style)
     return grid

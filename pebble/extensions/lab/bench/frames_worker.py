@@ -93,7 +93,7 @@ class ZenohWriter:
         self.close = self._writer.close
 
     def write(self, fill: Fill) -> bool:
-        """Send the frame that ``fill`` writes; return False, without one, while there is no reader."""
+        """Send the frame that ``fill`` writes. While there is no reader, send nothing and return False."""
         if not self._writer.wanted:
             return False
         slot = self._writer.slot(len(self._frame))

@@ -59,7 +59,7 @@ SECTIONS: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Headline:
-    """A row of the first table: a measure of a comparison, and the variants of its columns."""
+    """A row of the first table: a measure of a comparison, and the variant for each of the three columns."""
 
     what: str
     bench: str

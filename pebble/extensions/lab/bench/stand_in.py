@@ -2,7 +2,7 @@
 
 Program: ``python -m pebble.extensions.lab.bench.stand_in bridge|serial …``.
 
-What a user would have without us, after the description of the original in the paper; not the original's code, which is
+What a user would have without Pebble, after the paper's description of the original; not the original's code, which is
 not here. One process forwards between two brokers: a client on each side, whose ``on_message`` publishes on the other.
 Another owns the serial line: drive commands become lines at once, reports become messages. Neither watches how old a
 command is, bounds a queue, or stops the motors when commands end.

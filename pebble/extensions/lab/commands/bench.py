@@ -160,8 +160,8 @@ def _chosen(option: str, text: str, available: Collection[str]) -> tuple[str, ..
 def _run(name: str, quick: bool, output: Path, **options: Any) -> int:
     """Run the comparison ``name``, print and write its results; return 0 if they are complete. Raises PebbleError.
 
-    ``options`` replace fields of its Settings, unless they are None. A text is a list of values, separated by commas;
-    it may name only values that the field has in a full run.
+    ``options`` replace fields of its Settings, unless they are None. An option that is a text lists values, separated
+    by commas; each must be one that the field has in the comparison's FULL settings.
     """
     from rich.console import Console
 

@@ -95,7 +95,6 @@ def sim(
         from pebble.extensions.lab.simulation.mcu import run as run_mcu
 
         path = link or Path(tempfile.gettempdir(), f"pebble-{kind}")
-        typer.echo(f"{kind} is at {path}; Ctrl-C ends it")
         return run_mcu(kind, path, trace=trace, trace_output=trace_output, control=control)
     if broker is None:
         raise typer.BadParameter(f"{kind} needs --broker URL")

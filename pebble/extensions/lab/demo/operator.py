@@ -1,4 +1,4 @@
-"""A scripted operator of a broker's robots: it drives steps, an emergency stop, and a script that it overrules.
+"""A scripted operator of a broker's robots: it drives them in steps, stops them all, and overrules a script.
 
 It yields to people: a robot that another person drives, or has stopped, is left alone until the next step. Times are
 seconds of time.monotonic().
@@ -94,7 +94,7 @@ class EndedEarlyError(Exception):
 class Operator:
     """The demo's driver, with a thread and a connection of its own.
 
-    ``activity`` and ``events`` (seconds and a line) are for display. ``visitors`` knows the robots that people have.
+    ``activity`` and ``events`` (seconds and a line) are for display. ``visitors`` notes the robots that people take.
     ``completed`` collects the commands that were driven. The emergency stop and the script belong to the first round.
     """
 
@@ -273,6 +273,7 @@ class Operator:
     # -- a step, an emergency stop, and a script
 
     def _perform(self, step: Step) -> None:
+        """Set the lights of all robots, drive them for a while, and let them rest."""
         began = time.monotonic()
         channel = c.LIGHTS_FLASH if isinstance(step.lights, LightsFlash) else c.LIGHTS_SOLID
         lights = codec.encode(channel, step.lights)
@@ -280,7 +281,7 @@ class Operator:
             self._publish(robot.topic(channel), lights)
         released = self._hold(step.drive, step.drive_s)
         if step.sends_stop:
-            released = self._drive(STOP)
+            released = self._drive(STOP)  # a zero: from now on they must rest
         self._wait(step.rest_s)
         self._complete(step.name, step.drive, began, released, time.monotonic())
 
@@ -315,7 +316,7 @@ class Operator:
         self._complete(AFTER_RESET, _FORWARD, reset_at, released, time.monotonic())
 
     def _show_trails(self, robots: Sequence[RobotView]) -> None:
-        """Start the script that publishes a robot's position on each robot that has it, unless it runs another script.
+        """Start the script that publishes the position, on each robot that has this script and runs none.
 
         A robot that is stopped, or was driven a moment ago, refuses to start a script.
         """

@@ -35,7 +35,7 @@ class View:
             while self._operator.events:
                 at, line = self._operator.events.popleft()
                 self._print(at, line, "bold yellow")
-                self._step = line.removeprefix("operator ")  # as the activity has it, which is not printed again below
+                self._step = line.removeprefix("operator ")  # the activity says the same: no second line for it below
             now = time.monotonic()
             for robot in self._robots:
                 discovered = self._operator.discovery.robots.get(robot.base)

@@ -46,7 +46,7 @@ Config = Mapping[str, Any]
 class SimulatedRobot:
     """A robot on this machine. Its processes are among ``running``, and end with them.
 
-    ``entries()`` are measured at its MCU, independently of telemetry.
+    ``entries()`` are what its MCU received and did, noted there, independently of telemetry.
     """
 
     runs_on: str

@@ -37,8 +37,8 @@ def paced(
 class ScriptedOperator:
     """The operator of one robot; one thread calls it.
 
-    Its owner passes the robot's messages to ``robot``. ``publish`` sends a message at once. ``wait`` waits so many
-    seconds; an exception from it, or true, ends what is being done. ``device`` is shown to people who want control.
+    Its owner passes the robot's messages to ``robot``. ``publish`` sends a message at once. If ``wait(seconds)``
+    returns true or raises an exception, what is being done ends. ``device`` is shown to people who want control.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class ScriptedOperator:
 
     @property
     def has_control(self) -> bool:
-        """True if the operator has the control that it asked for; also if it has not asked, as where there is none."""
+        """True if the operator has the control that it asked for; also if it did not ask, as a robot may give none."""
         return self.control.held or not self.control.wanted
 
     def release(self) -> None:

@@ -152,7 +152,7 @@ class Testbed(Processes):
     ``broker_port``: the operators' broker, on loopback.
     """
 
-    ends_s = (1.0, 2.5, 1.0, 1.0)  # with the operator's disconnect: every process ends within five seconds
+    ends_s = (1.0, 2.5, 1.0, 1.0)  # shorter than usual: with the operator's disconnect all end within five seconds
     keep = True
     server: PageServer  # the newest
     room: Program | None = None  # once it runs
@@ -172,8 +172,8 @@ class Testbed(Processes):
 
         Raises PebbleError if a broker fails.
         """
-        names = "remote-broker", "freds-broker"
-        self.remote_broker, self.local_broker = (self.broker(name, program=program) for name in names)
+        broker_names = "remote-broker", "freds-broker"
+        self.remote_broker, self.local_broker = (self.broker(name, program=program) for name in broker_names)
         for broker in (self.remote_broker, self.local_broker):
             broker.wait(self._ending)
         self.broker_port = self.remote_broker.port

@@ -55,7 +55,8 @@ class SimulatedMcu:
         self._clock = VirtualClock(now)
         self.board = Board(self._clock)
         self.body = body_of(kind, self.board, motion)
-        self.body.on_motors = on_motors or self.body.on_motors
+        if on_motors is not None:
+            self.body.on_motors = on_motors
         self.motion, self.battery = self.body.motion, self.body.battery
         self._boot_output = b""
         self._runner = Runner(self.board, kind)

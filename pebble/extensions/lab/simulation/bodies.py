@@ -37,7 +37,7 @@ class Body:
         self.on_motors: Callable[[float, Pair], None] = lambda _now, _motors: None
         self._advanced_at = self._changed_at = board.clock.now()  # of motion and battery; of the outputs
         self._motors = self._reported = (0.0, 0.0)  # as the outputs set them; as passed to on_motors
-        self._stale = False  # the outputs have changed since the motors were set by them
+        self._outputs_changed = False  # since the motors were set by them
         board.pins.before_change = self.before_output_change
 
     def before_output_change(self) -> None:
@@ -46,12 +46,12 @@ class Body:
         Several may change in one turn: changes within a millisecond are reported together.
         """
         now = self.board.clock.now()
-        if self._stale and now == self._changed_at:
+        if self._outputs_changed and now == self._changed_at:
             return  # another output changes at the same moment
         if now - self._changed_at > _ONE_TURN_S:
             self.end_turn()  # reports the changes before this one
         self.advance()  # with the outputs as they were until now
-        self._stale, self._changed_at = True, now
+        self._outputs_changed, self._changed_at = True, now
 
     def end_turn(self) -> None:
         """End a turn of the firmware: call ``on_motors`` if the motors have changed."""
@@ -76,8 +76,8 @@ class Body:
 
     def _read_outputs(self) -> None:
         """Set the motors by the board's outputs, if these have changed."""
-        if self._stale:
-            self._stale = False
+        if self._outputs_changed:
+            self._outputs_changed = False
             self._motors = self.forward(*self.outputs())
 
     def outputs(self) -> Pair:

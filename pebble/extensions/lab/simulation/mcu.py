@@ -15,6 +15,7 @@ def run(kind: str, link: Path, *, trace: Path | None = None, trace_output: bool 
     with PtyMcu(kind, link, trace=trace, trace_output=trace_output) as mcu:
         if control:
             threading.Thread(target=_run_commands, args=(mcu, end), name="pebble-sim control", daemon=True).start()
+        print(f"{kind} is at {link}; Ctrl-C ends it", flush=True)  # noqa: T201
         end.wait()
     return 0
 

@@ -30,9 +30,9 @@ Motors = tuple[float, float]
 class WirelessRobot:
     """A robot; ``step`` is a turn of its loop. ``on_motors(seconds, (left, right))`` is called when motors change.
 
-    ``pause_s`` is the longest time until its next turn while its sockets are idle. ``files`` is the folder of its
-    board's files, which survive the program; None: they are in memory. ``name``: the robot's name for people; empty:
-    its id. ``security``: the level in its config.
+    ``pause_s`` is the longest time until its next turn while its sockets are idle; ``moving_s`` is that time while its
+    motors turn. ``files`` is the folder of its board's files, which survive the program; None: they are in memory.
+    ``name``: the robot's name for people; empty: its id. ``security``: the level in its config.
     """
 
     def __init__(

@@ -93,6 +93,7 @@ def picture(data: Bytes, info: FrameInfo, width: int | None = None) -> Bytes:
 
 
 def _raw(data: Bytes, info: FrameInfo) -> Bytes:
+    """Return the picture of a frame that is not compressed: ``bgr24``, ``nv12`` or ``yuyv``."""
     if info.format == "bgr24":
         return _rows(data, info, info.height, 3 * info.width).reshape(info.height, info.width, 3)
     cv2 = _opencv(f"a frame of format {info.format}")

@@ -58,10 +58,10 @@ class FrameReader:
         self._seen: set[int] = set()  # ids of writers that were counted
         self._newest = 0, 0  # writer and number of the newest frame that has arrived
         self._replaced = -1  # the writer before that of the newest frame
-        self._must_reopen = threading.Event()
+        self._must_reopen = threading.Event()  # to begin or to stop using shared memory
         self._lacked_room = False  # in shared memory, when the session was opened
-        self._changing = threading.Lock()
-        self._pid = 0
+        self._changing = threading.Lock()  # held while the reader is opened, reopened or closed
+        self._pid = 0  # of the process that opened the session: no fork of it can use it
         self._session: tuple[zenoh.Session, list[Any]] | None = None  # and what is declared there
 
     # -- opening and closing
@@ -200,7 +200,7 @@ class FrameReader:
             self.counters.add("skipped", skipped)
 
     def _missed(self, info: FrameInfo) -> int | None:
-        """Return how many frames were lost before this frame; None if this frame is an old one."""
+        """Note a frame as the newest one; return how many were lost before it. None if it is an old one."""
         writer, number = self._newest
         if info.writer == self._replaced:
             return None
@@ -212,7 +212,7 @@ class FrameReader:
         return info.sequence - number - 1 if info.writer == writer else 0
 
     def _on_writer(self, sample: zenoh.Sample) -> None:
-        """Note that a writer begins or ends; let the session be reopened if sharing memory with it changes."""
+        """Note that a writer begins or ends; let the session be reopened to begin or to stop sharing memory with it."""
         try:
             writer_id, size, segment = self._names.writer_of(str(sample.key_expr))
         except ValueError:
@@ -226,7 +226,7 @@ class FrameReader:
             self._seen.add(writer_id)
             self.counters.add("writers")
         self.running.add(writer_id)
-        if new and size and self._lacked_room:  # this writer has found room: so may the reader
+        if new and size and self._lacked_room:  # this writer shares memory, so it has found room: so may the reader
             self._lacked_room = False
             self._reopen_soon("")
         if size and self.shared and (problem := self._why_not_map(size, segment)):
@@ -298,9 +298,9 @@ class _LatestFrames:
         items, wakeup = self._items, self._wakeup
         while True:
             try:
-                return items.popleft()
+                return items.popleft()  # None: :meth:`wake` or :meth:`close` was called
             except IndexError:
-                if not wakeup.wait(end):
+                if not wakeup.wait(end):  # the time has come
                     return None
 
     def wake(self) -> None:

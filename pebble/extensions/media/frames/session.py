@@ -34,7 +34,7 @@ class StreamNames:
         self.socket = folder / f"frames-{stream}.sock"
         self.data = f"frames/{stream}/data"
         self.readers = f"frames/{stream}/reader/*"
-        self.writers = f"frames/{stream}/writer/*/*/*"
+        self.writers = f"frames/{stream}/writer/*/*/*"  # id, size and segment, see writer()
         self.folder, self.stream = folder, stream
         self._lock_name = f"frames-{stream}.{{}}.life"
 
@@ -42,11 +42,11 @@ class StreamNames:
         return self.readers.replace("*", name)
 
     def writer(self, writer_id: int, size: int, segment: str) -> str:
-        """Return the token that a running writer publishes: its id, the bytes that it shares, and its segment."""
+        """Return the token that a running writer publishes: its id, how many bytes it shares, and its segment."""
         return f"{self.writers.removesuffix('*/*/*')}{writer_id:x}/{size}/{segment or '-'}"
 
     def writer_of(self, token: str) -> tuple[int, int, str]:
-        """Return a writer's id, the bytes that it shares and its segment, from its token. Raises ValueError."""
+        """Return a writer's id, how many bytes it shares and its segment, from its token. Raises ValueError."""
         *_, writer_id, size, segment = token.split("/")
         return int(writer_id, 16), int(size), segment
 

@@ -77,7 +77,7 @@ class Chunk:
         self._view: Bytes | None = None
 
     def view(self) -> Bytes:
-        """Return the memory as an array. It keeps the provider alive, so that the memory stays mapped after sending."""
+        """Return the memory as an array, which holds Zenoh's provider: the memory stays mapped after sending."""
         if self._view is None:
             self._view = views.array(self._buffer, self._size, writable=True, owner=self._provider)
             if self._view is None:

@@ -128,7 +128,7 @@ class Broker:
         qos: QoS = QoS.DELIVERED,
         by: str = "",
     ) -> bool:
-        """Publish now, before streams; return False without a connection, or for an invalid topic.
+        """Publish with priority (``urgent``); return False without a connection, or for an invalid topic.
 
         ``remember`` False: do not publish it again if the broker loses it, since others may have published a newer
         value. ``by``: the person for whom it is sent; robots that take only commands with a sender's name read it.

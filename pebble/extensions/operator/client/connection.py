@@ -65,7 +65,7 @@ def connected(target: Target) -> Iterator[tuple[Transport, Names]]:
         if transport.state is not State.CONNECTED:
             why = transport.problem or f"no answer within {OPEN_TIMEOUT_S:g} s"
             raise TransportError(f"cannot connect to {where}: {why}")
-        not_received = _report_missing(transport)
+        not_received = _report_missing(transport)  # in words
         yield transport, names
         _report_missing(transport, not_received)  # what was subscribed to meanwhile may be refused
 
@@ -74,7 +74,7 @@ def connected(target: Target) -> Iterator[tuple[Transport, Names]]:
 def listening(target: Target, sender: Transport) -> Iterator[Transport]:
     """Yield a connection to the same broker as ``sender``, for receiving, so that what arrives delays no command.
 
-    It need not be connected yet. Yields ``sender`` itself if the config sets the client id, or on Zenoh.
+    The new connection may not be open yet. On Zenoh, or if the config sets the client id, it is ``sender`` itself.
     """
     kind, settings, _, _ = resolve(target)
     if not isinstance(settings, MqttSettings) or settings.client_id is not None:
@@ -132,7 +132,7 @@ def put_account_into_topics(transport: Transport, names: Names, is_named: Callab
 
 
 def _of_config(config: Config, target: Target) -> tuple[str, Any, Names, str]:
-    """Return what :func:`resolve` does, for a robot's local transport or the broker that its bridge connects to."""
+    """Return the result of :func:`resolve` for a robot's local transport, or the broker that its bridge connects to."""
     base = config.base if target.robot is None else base_of(target.robot)
     addresses = Addresses(config) if base == config.base else None  # of another robot no renamed topics are known
     if target.remote:
@@ -140,7 +140,8 @@ def _of_config(config: Config, target: Target) -> tuple[str, Any, Names, str]:
         return kind, settings, Names(base, addresses, _account(settings)), f"the remote side of {config.base}"
     names = Names(base, addresses)
     if config.transport.kind == "zenoh":
-        where = f"the hub of {config.base} in {config.run_dir()} (is the robot up?)"
+        start = f"pebble up {config.path or 'CONFIG'}"
+        where = f"the hub of {config.base} in {config.run_dir()} (is the robot up? `{start}` starts it)"
         return "zenoh", zenoh_settings(config, client=True), names, where
     where = f"{config.base} by {config.transport.kind}"
     if config.transport.kind == "mqtt":

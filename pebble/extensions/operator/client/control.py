@@ -60,7 +60,7 @@ class RobotControl:
         return "" if state is None or not state.id else state.by or "somebody"
 
     def receive(self, message: Message) -> bool:
-        """Update from a message of this robot; return False if it is no state of control, or malformed."""
+        """Update from a message of this robot; return True if a state of control was stored or removed."""
         owner = message.topic.removeprefix(self._prefix)
         if owner == message.topic or len(message.payload) > _STATE_BYTES:
             return False

@@ -21,7 +21,7 @@ class Discovery:
         return list(self.robots.values())  # a copy: robots may be added meanwhile
 
     def awaits_heartbeat(self, waited_s: float) -> bool:
-        """True if a first heartbeat may still come after ``waited_s``: of a known robot; of any if none is known."""
+        """True if a first heartbeat may still come after ``waited_s``: a known robot's, or any while none is known."""
         robots = self.all_robots()
         if not robots:
             return waited_s < silent_after()

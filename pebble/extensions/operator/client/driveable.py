@@ -8,6 +8,9 @@ from pebble.extensions.operator.client.robot_topics import section_of
 
 _STATUS_BYTES = 64 * 1024
 _WHY = 300  # characters
+#: The words of the page (``static/ui/fleet/doubt.js``), and those about a stopped robot.
+_DRIVEN = {"no": "Cannot be driven", "unknown": "Not known whether it can be driven"}
+_STOPPED = {"no": "nothing confirms that its motors stand", "unknown": "it is not known whether its motors stand"}
 
 
 class Driveable(NamedTuple):
@@ -16,13 +19,18 @@ class Driveable(NamedTuple):
     state: str
     why: str = ""
 
-    @property
-    def doubt(self) -> str:
-        """Return why the robot cannot be driven, in words; empty if it can."""
-        if self.state == "yes":
-            return ""
-        what = "CANNOT BE DRIVEN OR STOPPED" if self.state == "no" else "not known whether its motors obey"
-        return f"{what}: {self.why or 'it does not say why'}"
+
+def is_cut_off(driveable: Driveable | None) -> bool:
+    """True if no command reaches the motors, not even a stop, as the robot says itself."""
+    return driveable is not None and driveable.state == "no"
+
+
+def doubt_of(driveable: Driveable | None, *, stopped: bool = False) -> str:
+    """Return why drive commands, or (``stopped``) a stop, may have no effect; empty if the robot has no doubt."""
+    if driveable is None or driveable.state == "yes":
+        return ""
+    words = (_STOPPED if stopped else _DRIVEN)[driveable.state]
+    return f"{words}: {driveable.why}" if driveable.why else words
 
 
 def driveable_of(status: bytes) -> Driveable | None:

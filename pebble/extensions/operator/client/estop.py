@@ -82,6 +82,7 @@ class RobotStop:
         """Return how far the robot's stop has got; SPARED only if the stop is for all robots, not for named ones."""
         if self.confirmed_s is not None:
             return Progress.CONFIRMED
+        # SPARED: by its capabilities it has no motors, neither that a stop holds nor that it drives.
         if self.estop.has_capabilities and not (self.estop.available or self.estop.drives or self._order.named):
             return Progress.SPARED
         if self.estop.old:
@@ -200,7 +201,7 @@ class RobotStop:
         self._given_up = True
 
     def _survives(self, owner: str) -> bool:
-        """True if a power cut would change nothing for this owner, or if it cannot save anything."""
+        """True if no save is awaited: the owner has saved the stop, was reset since, or cannot save anything."""
         state = self.estop.states.get(owner)
         return state is not None and (state.persisted is not False or not state.latched)
 
@@ -325,7 +326,7 @@ class StopSender:
 
     @property
     def _collect_s(self) -> float:
-        """Return for how many seconds newly heard robots are stopped: longer if there are too many to be confirmed."""
+        """Return for how many seconds robots not heard before are stopped: more if ``robots`` has no room for some."""
         return GIVE_UP_S if self.omitted else COLLECT_S
 
     def _take_overflow(self) -> list[Message]:

@@ -50,6 +50,7 @@ class Reset:
         return state is not None and not state.latched
 
     def _refusal(self, owner: str) -> str:
+        """Return why an owner is still stopped."""
         before, now = self.shown[owner], self.robot.states.get(owner)
         if now is None:
             return "its state was removed"

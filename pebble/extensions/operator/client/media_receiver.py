@@ -93,6 +93,7 @@ class MediaReceiver:
             request.receive(message, time.monotonic())
 
         subscribe = self._transport.subscribe
+        # The flag is handled at once, as only media take long. Our own requests for it are not to come back.
         self._subscriptions.append(subscribe(request.flag_topic, on_flag, echo=False, direct=True))
         self._subscriptions.append(subscribe(request.media_topic, on_media, qos=QoS.LATEST))
 

@@ -78,7 +78,7 @@ class RobotEstop:
     def missing_control(self) -> list[str]:
         """Return the topics of the control states that are missing, if the robot publishes control.
 
-        They count as missing with the stop state of the same owner: a broker keeps back both states, or none.
+        An owner's control state counts as missing if its stop state is: a broker keeps back both states, or none.
         """
         owners = [owner for owner in self.owners if owner not in self._states] if self.keeps_control else []
         return [CONTROL_STATE.topic(self.base, owner=owner) for owner in owners]
@@ -87,7 +87,7 @@ class RobotEstop:
     def old(self) -> bool:
         """True if the robot is known to have no emergency stop.
 
-        False if only its broker refuses the topics of the stop: then its capabilities list the stop as not available.
+        False if a robot has one whose topics its broker refuses: its capabilities list the stop as not available.
         """
         return self.has_capabilities and not self.announces
 
@@ -140,6 +140,7 @@ class RobotEstop:
         return default if is_of_another(topic, self.base) else topic
 
     def _receive_state(self, owner: str, payload: bytes) -> bool:
+        """Store an owner's state, or remove it if it is empty; return False if there is none to store or remove."""
         if not _valid_level(owner) or len(payload) > _STATE_BYTES:
             return False
         if not payload:

@@ -81,11 +81,11 @@ def section_of(capabilities: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def own_topic(ref: str, topic: object, direction: str) -> bool:
-    """True if ``topic`` belongs to ``ref``, in that direction. Other topics in capabilities are ignored."""
+    """True if ``topic`` belongs to ``ref``, in that direction, and is valid. Others in capabilities are ignored."""
     if not isinstance(topic, str) or not topic.startswith(f"{ref}/{direction}/") or parse_topic(topic) is None:
         return False
     try:
-        return check_topic(topic) == topic
+        return check_topic(topic) == topic  # always: it raises an error for what may not be published to
     except TransportError:
         return False
 

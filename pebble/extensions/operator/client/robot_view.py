@@ -45,7 +45,7 @@ class Liveness:
         interval_s = None if self.received_at is None else now - self.received_at
         # shorter than any config allows: both heartbeats waited in a queue; longer: a pause, which is no interval
         if interval_s is not None and 0.05 <= interval_s <= 10.0:
-            if not self.reported_offline and self.online_to_people(now) is False:  # people had seen it go
+            if not self.reported_offline and self.online_to_people(now) is False:  # back from a silence alone
                 self._returns.append(now)
             self._intervals.append(interval_s)
         has_plausible_clock = -1.0 <= latency_s <= 10.0
@@ -156,7 +156,7 @@ class RobotView:
             self.charging = payload.value
         elif channel is c.AUTONOMY_STATUS:
             self.autonomy = payload
-        else:
+        else:  # a heartbeat
             self._take_announced(message.payload)
             if not message.retain:  # a heartbeat that is retained is no sign of life
                 self.liveness.heartbeat(now, wall - payload.t / 1000, online=payload.online is not False, t=payload.t)
@@ -185,7 +185,7 @@ class RobotView:
     def _note_retained_drive(self, message: Message) -> None:
         """Note whether a drive command that moves the robot is retained.
 
-        A message that is empty and not retained itself removes it.
+        An empty message, which brokers deliver without the retain flag, tells that the retained one was removed.
         """
         if message.retain or not message.payload:
             self.parked = bool(message.payload)
@@ -193,9 +193,9 @@ class RobotView:
                 self.parked = self.parked and codec.decode(c.DRIVE, message.payload).moves
 
     def _keep_for_late_stop(self, message: Message) -> None:
-        """Keep the topic's newest message: an emergency stop that begins later starts with all kept messages.
+        """Keep the topic's newest message: an emergency stop that this program sends later gets all kept ones first.
 
-        Capabilities have a place even after MAX_REMEMBERED states of owners.
+        Capabilities are kept even if there are MAX_REMEMBERED states of owners already.
         """
         has_place = message.topic in self.remembered or message.topic == c.CAPABILITIES.topic(self.base)
         if not message.payload:
@@ -319,7 +319,7 @@ class RobotView:
 
     @property
     def itself(self) -> str:
-        """Return the words for people that the robot drives itself, and by which script; empty if it does not."""
+        """Return words that tell people that the robot drives itself, and by which script; empty if it does not."""
         is_overridden = self.autonomy is not None and self.autonomy.overridden is True
         if not self.script or self.latched or is_overridden:
             return ""

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
-from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, CAPABILITIES, LINK, codec
+from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, CAPABILITIES, LINK, STATUS, codec
 from pebble.contract.payloads import AutonomyCommand, AutonomyStatus
 from pebble.errors import PayloadError, PebbleError
 from pebble.extensions.operator.client import forms
@@ -13,7 +13,7 @@ from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.transports import Message, QoS, Transport
 
 _BYTES = 512 * 1024  # of a list of scripts
-_RECEIVED = (CAPABILITIES, LINK, AUTONOMY_FILES, AUTONOMY_STATUS)
+_RECEIVED = (CAPABILITIES, LINK, STATUS, AUTONOMY_FILES, AUTONOMY_STATUS)
 _STARTS_S = 5.0  # that a script may take until its status shows it
 
 Entry = dict[str, Any]

@@ -41,7 +41,7 @@ def _zenoh(path: str) -> ZenohSettings:
     except OSError as error:
         raise UrlError(f"--url zenoh:{path}: {error.strerror}: run this as the user of the robot") from None
     if not is_there:
-        raise UrlError(f"--url zenoh:{path}: there is no such directory, is the robot up?")
+        raise UrlError(f"--url zenoh:{path}: there is no such directory, is the robot up? `pebble up CONFIG` starts it")
     return ZenohSettings(run_dir=run_dir, client=True)
 
 
@@ -68,7 +68,7 @@ def _mqtt(url: str, password: str | None, ca_cert: Path | None) -> MqttSettings:
         host=host,
         port=port,
         username=parts.user,
-        vital=ALL_VITAL,
+        vital=ALL_VITAL,  # small commands are sent even if the broker hangs up after them, see RefusedTopics
         password=password,
         tls=TlsSettings(ca_cert=ca_cert) if encrypted else None,
     )

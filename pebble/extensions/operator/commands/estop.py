@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
+from functools import partial
 from typing import Annotated
 
 import typer
@@ -30,7 +31,7 @@ from pebble.extensions.operator.client.connection import (
     wait_for,
 )
 from pebble.extensions.operator.client.discovery import Discovery
-from pebble.extensions.operator.client.driveable import Driveable
+from pebble.extensions.operator.client.driveable import Driveable, doubt_of, is_cut_off
 from pebble.extensions.operator.client.estop import Progress, RobotStop, StopSender, new_name, send
 from pebble.extensions.operator.client.estop_states import Reset, RobotEstop
 from pebble.extensions.operator.client.heartbeats import Heartbeats
@@ -75,7 +76,8 @@ def estop(
     This is software over a network, not a safety-rated stop: where people can be hurt, cut the power of the motors.
 
     A stopped robot moves nothing, also after a restart, until `pebble estop reset`. The stop is repeated until every
-    motor owner of the robot has confirmed it, for at most a minute. Exit code 0: confirmed; 1: not confirmed.
+    motor owner of the robot has confirmed it, for at most a minute. Exit code 0: confirmed; 1: not confirmed, or the
+    robot says that no command reaches its motors.
 
     \b
         pebble estop goob.json
@@ -136,7 +138,7 @@ def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
             transport, names, lambda base: base in sender.robots and sender.robots[base].estop.named
         )
         outbox = _Outbox(transport, sender)
-        outbox.publish()
+        outbox.publish()  # at once, before anything else
         report = _Report(sender, outbox)
         try:
             with _heartbeats(target, every=every) as heartbeats, listening(target, transport) as second:
@@ -144,7 +146,7 @@ def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
                 while not sender.finished:
                     for message in heartbeats.take() if heartbeats else ():
                         sender.receive(message, time.monotonic())
-                    outbox.publish()
+                    outbox.publish()  # to robots that were just heard, before the wait
                     _receive(listener, sender, _until_due(sender, has_heartbeats=heartbeats is not None))
                     _drop_other_spelling(sender)
                     outbox.publish()
@@ -156,17 +158,25 @@ def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
                 subscribing.join(_ANSWER_S)
                 wait_for(lambda: second.state is State.CONNECTED, _ANSWER_S)
                 _receive(listener, sender, _ON_ITS_WAY_S)
+                since = time.monotonic()  # a robot that has just started says for a moment that it is cut off
+                while _any_cut_off(sender) and time.monotonic() < since + _ANSWER_S:
+                    _receive(listener, sender, _ON_ITS_WAY_S)
         except KeyboardInterrupt:
             sender.end()
         report.end()
-    return 0 if sender.confirmed else 1
+    return 0 if sender.confirmed and not _any_cut_off(sender) else 1
+
+
+def _any_cut_off(sender: StopSender) -> bool:
+    """True if a robot says that no command reaches its motors."""
+    return any(is_cut_off(robot.driveable) for robot in sender.robots.values())
 
 
 @contextmanager
 def _heartbeats(target: Target, *, every: bool) -> Iterator[Heartbeats | None]:
-    """Open a connection for the heartbeats of all robots, for a stop of all at a broker; otherwise yield None.
+    """Yield a connection for heartbeats if all robots of a broker are to be stopped (``every``), else None.
 
-    With a client id from the config there can be only one connection.
+    It is None, too, with a client id from the config, with which there can be only one connection.
     """
     _, settings, _, _ = resolve(target)
     if not every or not isinstance(settings, MqttSettings) or settings.client_id is not None:
@@ -270,10 +280,13 @@ class _Report:
             _echo(f"there are more than {len(sender.robots)} robots: the others got the stop, NOT CONFIRMED")
 
     def _print(self, *, is_early: bool) -> None:
+        """Print the lines that have changed; ``is_early``: see :func:`_line`."""
         for base, robot in list(self._sender.robots.items()):
+            if is_early and robot.driveable is None and robot.progress is Progress.CONFIRMED:
+                continue  # its status may be on its way, and say that no stop reaches the motors
             line = _line(robot, is_early=is_early, sent=self._outbox.has_sent(base))
-            if line and robot.driveable is not None and robot.driveable.doubt:
-                line += f"; its status says: {robot.driveable.doubt}"
+            if line and (doubt := doubt_of(robot.driveable, stopped=True)):
+                line += f"; {doubt}"
             if self._lines.get(base, "") != line:
                 self._lines[base] = line
                 _echo(shown(f"{id_of(base)}: {line}"))
@@ -293,10 +306,11 @@ def _line(robot: RobotStop, *, is_early: bool, sent: bool) -> str:
         case Progress.CONFIRMED if not robot.estop.latched:
             return "was stopped, and reset since"
         case Progress.CONFIRMED:
-            took = f"after {robot.confirmed_s:.2f} s"
-            if robot.saved:
-                return f"stopped and confirmed {took}"
-            return f"stopped {took}, {'not saved yet' if robot.sending else 'NOT SAVED: a restart frees it'}"
+            held = "stopped and confirmed" if robot.saved else "stopped"
+            if is_cut_off(robot.driveable):
+                held = f"latched, confirmed by {', '.join(robot.estop.owners)}"
+            unsaved = ", not saved yet" if robot.sending else ", NOT SAVED: a restart frees it"
+            return f"{held} after {robot.confirmed_s:.2f} s{'' if robot.saved else unsaved}"
         case Progress.OLD if robot.sending:
             return "old firmware: zeros are sent, it cannot be latched"
         case Progress.OLD:
@@ -340,8 +354,10 @@ def _reset(target: Target) -> int:
             return base == robot.base and robot.named
 
         put_account_into_topics(transport, names, is_named)
-        # for ``view.pace``; the times of arrival do not matter
-        receiving.subscribe(LINK.topic(robot.base), lambda message: view.receive(LINK, message, 0.0, 0.0), direct=True)
+        # for ``view.pace`` and ``view.driveable``, the longer one where it delays no answer; times do not matter
+        for channel, connection in ((LINK, receiving), (STATUS, transport)):
+            take = partial(view.receive, channel, now=0.0, wall=0.0)
+            connection.subscribe(channel.topic(robot.base), take, direct=True)
         receiving.ask(robot.missing)  # stop states: the capabilities that list the owners may just have come
         wait_for(lambda: not robot.missing, _ANSWER_S)
         if not robot.states:
@@ -360,7 +376,8 @@ def _reset(target: Target) -> int:
         if refusals := reset.refusals():
             owner, why = next(iter(refusals.items()))
             raise PebbleError(shown(f"{name} is still stopped: {owner}: {why}; look again, then repeat"))
-    typer.echo(f"{name}: free; it moves again once drive commands have paused for half a second")
+    doubt, moves = doubt_of(view.driveable), "it moves again once drive commands have paused for half a second"
+    typer.echo(shown(f"{name}: free; {f'its status says: {doubt}' if doubt else moves}"))
     return 0
 
 
@@ -409,8 +426,8 @@ def _print_states(robot: RobotEstop, driveable: Driveable | None = None, *, sile
     elif missing or not robot.states:
         lines.append(f"{name}: unknown, no state of {', '.join(missing) or 'any motor owner'}")
     lines = lines or [f"{name}: free"]
-    if driveable is not None and driveable.doubt:
-        lines.append(f"{name}: {driveable.doubt}")
+    if doubt := doubt_of(driveable, stopped=bool(robot.latched)):
+        lines.append(f"{name}: {doubt}")
     for line in lines:
         typer.echo(shown(line))
 

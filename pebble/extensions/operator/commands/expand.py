@@ -7,7 +7,7 @@ import typer
 
 from pebble.extensions.operator.client.connection import Target, connected, put_account_into_topics
 from pebble.extensions.operator.commands.options import CaCert, PasswordFile
-from pebble.extensions.operator.signals import interrupted_by_signals
+from pebble.extensions.operator.signals import interrupted_by_signals, until_ended
 
 
 def expand(
@@ -26,10 +26,11 @@ def expand(
     from pebble.extensions.thin.expander import ANNOUNCE_S, Expander
 
     target = Target(url=url, password_file=password_file, ca_cert=ca_cert, program="expand")
-    with interrupted_by_signals(), connected(target) as (transport, names):
+    with interrupted_by_signals(), until_ended(), connected(target) as (transport, names):
         expander = Expander(transport)
         put_account_into_topics(transport, names, expander.is_named)
         expander.start()
         while True:
             expander.announce()
             time.sleep(ANNOUNCE_S)
+    return 0

@@ -231,6 +231,7 @@ def stopped(state: EstopState, wall: float) -> str:
 
 
 def _cells(record: TopicRecord, now: float, wall: float) -> tuple[str, str, str, str]:
+    """Return the cells retained, rate, size and age of a topic; ``now`` is monotonic, ``wall`` epoch seconds."""
     retained = "yes" if record.retained else ""
     if record.last is None:
         return retained, "", "", ""

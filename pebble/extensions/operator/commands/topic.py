@@ -31,6 +31,7 @@ from pebble.extensions.operator.commands.draft import draft
 from pebble.extensions.operator.commands.expand import expand
 from pebble.extensions.operator.commands.target import with_target
 from pebble.extensions.operator.commands.topic_contract import contract
+from pebble.extensions.operator.signals import until_ended
 from pebble.transports import QoS, Transport
 from pebble.transports.topics import is_pattern
 
@@ -113,7 +114,7 @@ def echo(
         pebble topic echo capabilities -c goob.json --raw -n 1 | jq .value.drive
     """
     printed = 0
-    with connected(target) as (transport, names):
+    with until_ended(), connected(target) as (transport, names):
         robot = _estop(transport, names, topic)
         if robot is not None and robot.stopped_by is not None:
             typer.echo(f"pebble: {show.stopped_line(robot, time.time())}", err=True)
@@ -163,7 +164,7 @@ def pub(
         pebble topic pub flags/mqtt-video true -c fred.json
         pebble topic pub lights-flash @party.json --url mqtt://127.0.0.1 -r goob
     """
-    with connected(target) as (transport, names):
+    with until_ended(), connected(target) as (transport, names):
         message = draft(names, topic, payload, retain=retain, qos=qos, force=force)
         for warning in message.warnings:
             typer.echo(f"pebble: warning: {warning}", err=True)
@@ -201,7 +202,7 @@ def hz(topic: Name, window: WindowOption = 100, seconds: SecondsOption = None, *
         pebble topic hz front-camera --url mqtt://127.0.0.1 -r goob
     """
     meter = RateMeter(window_s=math.inf, limit=window + 1)
-    with connected(target) as (transport, names):
+    with until_ended(), connected(target) as (transport, names):
         listener = Listener(transport, names.filters(topic))
         end, report_at, reported = _end(seconds), time.monotonic() + _REPORT_PERIOD_S, 0
         while time.monotonic() < end:

@@ -95,6 +95,7 @@ def _save(picture: Picture, file: Path) -> None:
 
 
 def _target(robot: str, url: str | None, password_file: Path | None, ca_cert: Path | None) -> Target:
+    """Return where to connect: at ``url`` or, by a config, at operators' broker if it names one, else at the robot."""
     if url is not None:
         return Target(url=url, robot=robot, password_file=password_file, ca_cert=ca_cert)
     if not Path(robot).is_file():

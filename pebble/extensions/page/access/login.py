@@ -104,6 +104,7 @@ def _cookie(settings: WebSettings) -> str:
 
 
 async def _page(request: Request) -> Response:
+    """Answer with the login page; who has a session is sent on."""
     if session_of(request) is not None:
         return Response(status_code=303, headers={"location": root_of(request), **_NO_STORE})
     state = request.app.state

@@ -61,7 +61,7 @@ def drive(
             _drive(transport, driver, terminal)
     if driver.unconfirmed:
         typer.echo(f"pebble: the emergency stop of {driver.name} is NOT CONFIRMED", err=True)
-    return 0 if terminal.ended in ("SIGINT", END) else 1
+    return 0 if terminal.ended in ("SIGINT", "SIGTERM", END) and not driver.unconfirmed else 1
 
 
 def _drive(transport: Transport, driver: TerminalDriver, terminal: Terminal) -> None:

@@ -10,6 +10,7 @@ from pebble import contract as c
 from pebble.contract import channel_of
 from pebble.extensions.operator.client.assumed import AXES, HEARD_S, PARKED
 from pebble.extensions.operator.client.drive_reasons import first_reason, words
+from pebble.extensions.operator.client.driveable import doubt_of, is_cut_off
 from pebble.extensions.operator.client.estop import StopSender, new_name
 from pebble.extensions.operator.client.names import id_of
 from pebble.extensions.operator.client.robot_view import RobotView
@@ -58,7 +59,8 @@ class TerminalDriver:
     @property
     def filters(self) -> list[str]:
         """Return filters of the topics that :meth:`receive` needs."""
-        channels = [c.ESTOP_STATE, c.CONTROL_STATE, c.CAPABILITIES, c.ONLINE, c.CHARGING_LEVEL, c.AUTONOMY_STATUS]
+        channels = [c.ESTOP_STATE, c.CONTROL_STATE, c.CAPABILITIES, c.ONLINE, c.STATUS]
+        channels += [c.CHARGING_LEVEL, c.AUTONOMY_STATUS]
         if self._heartbeat:  # as heartbeats, the state of the link exists only outside of the robot
             channels.append(c.LINK)
         if self._assumes:
@@ -101,10 +103,11 @@ class TerminalDriver:
         self._ticked_at = now
         self._assume(now)
         clock = self._tab.clock
-        clock.echo(clock.ping(now), 1000 * now, now)  # at once: no network is between keys and driver
+        # Answered at once, as no network is between keys and driver: unanswered pings would count as a slow page.
+        clock.echo(clock.ping(now), 1000 * now, now)
         view = self._driven.shown(self._tab, now)
         may_request = self.robot.situation(now).published
-        if view.keeps:  # the robot itself decides who drives it: it must have published who does
+        if view.keeps:  # the robot itself decides who drives: nothing is requested before it has published who does
             may_request = self._driven.published is not None
         if self._willing and may_request and not view.by and not view.asking:
             self._take(now, over=False)
@@ -131,16 +134,19 @@ class TerminalDriver:
         return "" if self.stop is None or self.stop.confirmed else self.stop.robots[self.robot.base].why
 
     def status(self) -> str:
-        """Return the status line: the command sent, or why none is sent, with texts of the robot and other persons."""
+        """Return the status line: the command sent, or why none is. It has names from others: make it printable."""
         view, robot = self._driven.shown(self._tab, self._ticked_at), self.robot
         x, z, _ = self._wanted(self._ticked_at)
         motion = self._reason or ("let go first" if self._pressed else "ready")
         if self._driven.state is State.MOVING:
             motion = f"driving x {x:+.2f} z {z:+.2f}"
+        if is_cut_off(robot.driveable):  # whatever is sent, nothing moves it
+            motion = self._reason
         parts = (
             self.name,
             robot.itself,  # that it drives itself, by a script
             motion,
+            doubt_of(robot.driveable, stopped=robot.latched),
             self.unconfirmed and f"EMERGENCY STOP NOT CONFIRMED: {self.unconfirmed}",
             f"{view.asks} asks for control: l lets {view.asks} drive" if view.you and view.asks else "",
             *([] if view.you else self._failures),  # ``you``: this terminal has control
@@ -151,7 +157,7 @@ class TerminalDriver:
         return " · ".join(filter(None, parts))
 
     def _assume(self, now: float) -> None:
-        """Assume that a board without capabilities drives after some seconds online, if the person says so."""
+        """Assume that a board without capabilities drives, once it was online for HEARD_S, if the person says so."""
         if self._assumes:
             self._heard_at = min(self._heard_at, now) if self.robot.online(now) else float("inf")
             if now - self._heard_at >= HEARD_S:
@@ -177,7 +183,7 @@ class TerminalDriver:
         view, situation = self._driven.shown(self._tab, now), self.robot.situation(now)
         situation = situation._replace(
             driven=view.by != "" and not view.you,
-            listening=not view.you,  # this terminal has no control, even if no other person has it
+            listening=not view.you,  # "Take control to drive": a terminal needs control even if no person has it
             stopping=self.stop is not None and not self.stop.finished,
         )
         if not self._heartbeat:

@@ -94,11 +94,11 @@ class Tab:
     last_ended: int = -1  # this gesture and all before it have ended
 
     def end_until(self, gesture: int) -> None:
-        """Note that this gesture, and all before it, have ended for good."""
+        """Note that this gesture, and all earlier ones, have ended for good."""
         self.last_ended = max(self.last_ended, gesture)
 
     def interrupt(self, gesture: int, now: float) -> list[Command]:
-        """End this gesture, and all before it, for good; halt the robot if the page moves it by one of them."""
+        """End this gesture, and all earlier ones, for good; halt the robot if the page moves it by one of them."""
         self.end_until(gesture)
         return [] if self.moves is None or self.gesture > gesture else self.moves.interrupt(now)
 
@@ -127,7 +127,7 @@ class DrivenRobot:
         self._idle_from = float("-inf")  # when control was given, or the last gesture ended
         self._sent_at = self._received_at = float("-inf")  # the last command of the gesture
         self._repeats: list[float] = []  # when to send the last zero again, in order
-        self._awaited = ("", float("-inf"))  # a page, by its token, that had control; and until when
+        self._awaited = ("", float("-inf"))  # token of a connection that ended with control; until when it counts
         self.renew_key()
 
     def renew_key(self) -> None:
@@ -170,7 +170,7 @@ class DrivenRobot:
         return self.tab is tab or tab in self._wishes
 
     def awaits(self, token: str, now: float) -> bool:
-        """True if control, which no client has now, waits for a page with this token. Asking ends the wait."""
+        """True, once, if ``token``'s connection ended with control, AWAITED_S ago at most, and no client has it now."""
         awaited, until = self._awaited
         if awaited != token:
             return False
@@ -201,7 +201,7 @@ class DrivenRobot:
     def take(
         self, tab: Tab, now: float, granted: Callable[[], None], failed: Callable[[str], None], *, over: bool
     ) -> list[Command]:
-        """Request control for a page; ``over``: even from its holder. Return what to publish if this server gives it.
+        """Request control for a page; ``over``: even from its holder. Return what to publish if the server grants it.
 
         ``granted``, or ``failed`` with the reason, is called with the answer: now, or after the robot's next state.
         """
@@ -269,7 +269,7 @@ class DrivenRobot:
         if now - self._sent_at < pace.step_s:  # a thin link carries fewer commands than the page sends
             return [], ""
         self._sent_at = now
-        drive = self._signed(Drive(x=op.x, z=op.z, y=op.y, valid_ms=WIDE.valid_ms))  # on a thin link as `dated` says
+        drive = self._signed(Drive(x=op.x, z=op.z, y=op.y, valid_ms=WIDE.valid_ms))  # `dated` changes it on a thin link
         return [Command(self.ref, pace.dated(drive, now, self._key), pace.qos)], ""
 
     def stop(self, now: float) -> list[Command]:
@@ -321,7 +321,7 @@ class DrivenRobot:
         return commands
 
     def _give(self, tab: Tab, client: ControlClient | None, now: float) -> list[Command]:
-        """Give a page control, by its request to the robot or (``client`` None) by this server; halt what moves."""
+        """Give a page control; halt what moves. ``client`` has got control of the robot; None: this server gives it."""
         commands = self._on(Event.GIVEN, now) + tab.interrupt(tab.gesture, now)  # a key held down now moves no robot
         self.tab, self.client, self._given_key = tab, client, "" if client is None else client.decided
         self._idle_from = now
@@ -352,7 +352,7 @@ class DrivenRobot:
     def _has_ended(self, wish: Wish, now: float) -> bool:
         """True if the page wants no control any more, and the robot confirms that or has not answered in time."""
         if not wish.client.done:
-            wish.ended_at = float("inf")
+            wish.ended_at = float("inf")  # it may have asked again
             return False
         wish.ended_at = min(wish.ended_at, now)
         state = self.published
@@ -387,14 +387,15 @@ class DrivenRobot:
         return words(Code.LATE) if tab.clock.late(op.t, now) else ""
 
     def _zero(self, tab: Tab, op: DriveOp, now: float) -> list[Command]:
-        """Return a zero to publish, which is sent in every state. It ends the gesture, and all before it."""
+        """Return a zero to publish, which is sent in every state. It ends this gesture and the page's earlier ones."""
         tab.end_until(op.g)
         if tab.moves is self and op.g >= tab.gesture:
             self._on(Event.LETS_GO, now)
-        commands = tab.interrupt(op.g, now)  # of another robot that the page moves
+        commands = tab.interrupt(op.g, now)  # zeros of another robot, if the page moves that by this gesture
         if self._is_assumed:  # while such a board connects anew, only a later zero stops it
             self._repeat_zeros(now)
-        is_release = self.tab is tab and not op.final  # the driver has let go: an interrupted script may resume
+        # Unless it is ``final`` (see DriveOp), the driver has let go: an interrupted script may resume.
+        is_release = self.tab is tab and not op.final
         return [Command(self.ref, self._signed(ZERO) if is_release else FINAL_ZERO), *commands]
 
     def _signed(self, drive: Drive) -> Drive:

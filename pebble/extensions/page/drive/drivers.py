@@ -39,7 +39,7 @@ class Drivers:
     def __init__(self, broker: Broker, robots: Robots) -> None:
         self._broker, self._robots = broker, robots
         self._driven: dict[str, DrivenRobot] = {}
-        self._changed: set[str] = set()
+        self._changed: set[str] = set()  # robots whose drivers must be shown to pages again
         self._lights: dict[str, _Lights] = {}  # by robot
         self._grouped: set[str] = set()  # robots that were sent a group since their last zero
         self.refusals = Refusals(broker, lambda ref: self.robot(ref).moved_by, robots.view)
@@ -180,8 +180,8 @@ class Drivers:
         accepted = True
         for command in commands:
             publish = self._publish_moving if command.drive.moves else self._publish_zero
-            payload = (self._robots.view(command.ref) or RobotView(command.ref)).encode(command.drive)
-            accepted = publish(command, payload, by) and accepted
+            robot = self._robots.view(command.ref) or RobotView(command.ref)  # an unknown one gets the usual form
+            accepted = publish(command, robot.encode(command.drive), by) and accepted
         if self._changed:
             self._robots.mark_drivers(set(self._changed))
             self._changed.clear()
@@ -201,7 +201,7 @@ class Drivers:
         """Publish a zero by itself, and then the robot's lights: they must not delay it."""
         ref, qos = command.ref, command.qos
         accepted = self._broker.publish(self._robots.topic(ref, DRIVE), payload, qos=qos, by=by)
-        if ref in self._grouped:  # the same topic again: this replaces a group that still waits for a slow connection
+        if ref in self._grouped:  # a group without lights replaces one that still waits for a slow connection
             self._grouped.remove(ref)
             self._broker.publish(GROUP.topic(ref), joined({DRIVE.metric: payload}), qos=qos, by=by)
         self._publish_lights(ref)

@@ -44,8 +44,8 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
 
     def __init__(self, broker: Broker, robots: Robots, ref: str) -> None:
         super().__init__(broker, robots, ref, "video", "web/picture", _AT_REST)
-        self._rescue = RescueStream(self._on_rescued)
-        self._sequence = PictureSequence()  # of the robot's pictures
+        self._rescue = RescueStream(self._on_rescued)  # JPEGs for pages that cannot use the robot's own pictures
+        self._sequence = PictureSequence()  # of the robot's pictures: notices missing ones
         #: The newest key frame and all pictures since; empty: one is missing, or it would be too long.
         self._chain: list[bytes] = []
         self._chain_bytes = 0
@@ -84,7 +84,7 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
             self._skip(now)
 
     def _extend_chain(self, payload: bytes, header: PictureHeader, *, fits: bool) -> None:
-        """Add a picture to the chain, or begin or end it. ``fits``: no picture before this one is missing."""
+        """Extend, begin or end the chain: a key frame and all pictures since. ``fits``: none is missing before this."""
         grown = self._chain_bytes + len(payload)
         if header.keyframe:
             self.key = KeyFrame(payload, time.monotonic())

@@ -41,7 +41,7 @@ class SoundQueue:
 
     def __init__(self) -> None:
         self._queue: deque[bytes] = deque()
-        self._bytes = self._sent = self._received = 0
+        self._bytes = self._sent = self._received = 0  # bytes that wait; packets sent, and received by the page
 
     def offer(self, payload: bytes) -> None:
         self._queue.append(payload)
@@ -95,6 +95,7 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
         self._end_talk(viewer)
 
     def receive(self, payload: bytes) -> None:
+        """Queue a piece of the robot's sound for each page that can decode it: ``can`` has the encodings."""
         encoding = _encoding(payload)
         if not encoding:
             return
@@ -187,6 +188,7 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
         return [viewer.can for viewer in self.viewers if viewer.can]
 
     def _make_view(self, state: str, why: str, _rate: float, _kbits: float) -> SoundView:
+        """Return the state of the sound for pages, which show rates of pictures only."""
         return SoundView(
             state=state,
             why=why,

@@ -65,7 +65,7 @@ class MediaStream(ABC, Generic[ViewerT, ViewT]):
     """
 
     def __init__(self, broker: Broker, robots: Robots, ref: str, medium: Medium, metric: str, view: ViewT) -> None:
-        """Store the arguments. Pages show the state ``metric``; ``view`` is its value while nothing is requested."""
+        """Store the arguments. ``metric``: the state for pages; ``view``: its value while nothing is requested."""
         self.ref = ref
         self.viewers: set[ViewerT] = set()
         self.view = self._at_rest = view  # as shown last

@@ -1,4 +1,4 @@
-"""The process that plays one robot's recording for one page: it takes what the page asks for, and sends its messages.
+"""The process that plays one robot's recording for one page: it obeys the page, and sends the recording's messages.
 
 Both ways each message has a head: its size, and whether it is text or binary. The program:
 ``python -m pebble.extensions.page.recordings.playing SOCKET FOLDER ROBOT AT_MS``.
@@ -105,8 +105,8 @@ class Link:
 class RobotSource:
     """The messages of one robot in an archive, for a player.
 
-    ``begins`` is called before the state at a time is sent, with that time and the picture then. A message
-    received exactly at a time belongs to the state at that time.
+    Before the state at a time is sent, ``begins`` is called with that time and the camera's newest picture at it. A
+    message received exactly at a time belongs to the state at that time.
     """
 
     def __init__(self, archive: Archive, ref: str, begins: Callable[[int, Recorded | None], None]) -> None:
@@ -225,7 +225,7 @@ class PlayedRobot:
         position_ms = self.player.position_ns / 1e6
         rests = self.player.paused and not self._is_new  # after a seek even a paused player has something to show
         is_position_due = not rests and now - self._played_at >= _PLAYED_S
-        if is_position_due or rests != self._rested:
+        if is_position_due or rests != self._rested:  # the page knows another state than the present one
             self._rested = rests
             self._show()
         if not rests and now - self._liveness_at >= _LIVENESS_S and self._robot.live:
@@ -249,6 +249,7 @@ class PlayedRobot:
             payload = harmless(payload, self._ref, self._replayed)
         elif (channel := _LIVENESS.get(metric)) is not None:
             retained = message.channel.metadata.get("retained") == "1"
+            # A recording has one clock: it stands for the monotonic one and for the time of day.
             self._robot.receive(channel, Message(message.channel.topic, payload, retain=retained), received, received)
         try:
             payload = shown(c.channel_of(f"{Direction.OUTGOING}/{metric}"), payload, msgspec.json.decode(payload))

@@ -81,7 +81,7 @@ def _rm(recordings: Folder, base: str | None, period_ns: tuple[int, int], keeps:
         else:
             report_left(f"{entry.path}: is not finished, or damaged")
             unsure += 1
-    if not unsure:
+    if not unsure:  # else the robot may be in a file that was not read
         check_names(Query(base), finished, [recordings.root])
     due = [path for path in finished if _reaches_into(path, *period_ns)]
     what = f"{shown(base)} " if base else "everything "

@@ -127,6 +127,7 @@ def _looked_at(
                 unread.append(str(error))
             if info.problem:
                 unread.append(f"{path}: {info.problem}")
+            # A file without messages has no times, and is in the list of any period.
             if info.first_ns < until_ns and (info.last_ns >= since_ns or not info.messages):
                 looked.append(info)
             advance(number)
@@ -155,6 +156,7 @@ def _state(info: FileInfo) -> str:
 
 
 def _print_events(paths: Iterable[Path]) -> None:
+    # A recorder's events are in its files of states only.
     events = list(catalogue.events(path for path in paths if ".media." not in path.name))
     if events:
         typer.echo("\nWhat happened to the recording:")

@@ -47,7 +47,7 @@ def progress(what: str, total: int) -> Iterator[Callable[[float], None]]:
 
 @contextmanager
 def progress_of_time(paths: list[Path], since_ns: int, until_ns: int) -> Iterator[Callable[[int], None]]:
-    """Yield a function that reports the time of the message that is being exported."""
+    """Yield a function that moves a progress bar; call it with the time of each message when that is exported."""
     first_ns, last_ns = [], [0]
     for path in paths:
         with RecordingFile(path) as file:

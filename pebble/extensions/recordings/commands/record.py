@@ -93,7 +93,7 @@ def _run(recorder: Recorder, source: Source, where: str, length: str | None) -> 
         except KeyboardInterrupt:
             pass
         if sys.stderr.isatty():
-            typer.echo("", err=True)
+            typer.echo("", err=True)  # ends the line that _serve rewrites
 
 
 def _serve(recorder: Recorder, source: Source, ends_at: float | None) -> None:

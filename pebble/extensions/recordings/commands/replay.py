@@ -89,7 +89,7 @@ def replay(
     player = playing.play(make_transport, rules, make_player)
     typer.echo(f"{player.sent} sent, {player.skipped} skipped")
     unread = report_unread(problems(source.damages))
-    return unread if playing.ended in ("", "SIGINT") else 1
+    return unread if playing.ended in ("", "SIGINT", "SIGTERM") else 1  # 1: its terminal was closed
 
 
 def _read(recordings: list[Path], options: Options) -> tuple[ReplaySource, Rules]:
@@ -117,10 +117,14 @@ class _Playing:
         self._problem = ""
 
     def play(self, make: Make, rules: Rules, make_player: Callable[..., Player]) -> Player:
-        """Replay for the robots of ``rules``. Raises TransportError."""
+        """Replay for the robots of ``rules``. Raises TransportError.
+
+        ``make`` makes a transport. ``make_player`` makes the player for an output and the function that it waits by.
+        """
         robots = ReplayedRobots(make, rules.robots)
         with handled_by(self._end), robots:
             output = BusOutput(rules, robots.publish, time.time_ns)
+            # The player waits only in ``run``, when ``player`` has its value.
             player: Player = make_player(output, wait=lambda seconds: self._wait(seconds, player, robots))
             typer.echo(", ".join(map(shown, rules.robots)))
             sys.stdout.flush()

@@ -72,7 +72,7 @@ class Schemas:
         return getattr(importlib.import_module(f"foxglove_schemas_protobuf.{schema}_pb2"), schema)(**fields)
 
     def descriptors(self, message: Any) -> bytes:
-        """Return the file descriptors of a message, each after those that it imports: a schema in MCAP's terms."""
+        """Return a message's protobuf FileDescriptorSet, each file after its imports: a schema in MCAP's terms."""
         files: dict[str, Any] = {}
 
         def add(file: Any) -> None:

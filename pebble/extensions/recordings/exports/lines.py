@@ -111,12 +111,12 @@ def _message(number: int, line: bytes) -> Recorded | BadLine:
     try:
         parsed = _decoder.decode(line)
         check_topic(parsed.topic.removeprefix("$"))  # our own events have one
-        log_ns = _stamp_ns(bytes(parsed.timestamp))
+        log_ns = _ns_of_seconds(bytes(parsed.timestamp))
     except (ValueError, OverflowError, RecursionError, TransportError) as error:  # msgspec's are ValueErrors
         return BadLine(number, str(error))
     payload = parsed.payload_b64
     encoding = "json" if payload[:1] in (b"{", b"[") else "application/octet-stream"
-    channel = Channel(0, parsed.topic, encoding, _metadata(parsed))
+    channel = Channel(0, parsed.topic, encoding, _metadata(parsed))  # 0: a line numbers neither channel nor message
     return Recorded(channel, 0, log_ns, stamp_ns(payload), payload)
 
 
@@ -127,7 +127,7 @@ def _metadata(line: _Line) -> dict[str, str]:
     return delivery | {name: "1" for name, is_set in flags.items() if is_set}
 
 
-def _stamp_ns(stamp: bytes) -> int:
+def _ns_of_seconds(stamp: bytes) -> int:
     """Convert a number of seconds since 1970 to nanoseconds. Raises ValueError."""
     with suppress(ArithmeticError):
         ns = Decimal(stamp.decode()) * 10**9

@@ -237,7 +237,7 @@ class RecordingFile:
         if not counted.channel_message_counts.keys() <= summary.channels.keys():
             return False
         for record in (*summary.schemas.values(), *summary.channels.values()):
-            self._name(record)
+            self._declare(record)
         self._metadata = [index.offset for index in summary.metadata_indexes]
         self.chunks, self.statistics = chunks, counted
         return True
@@ -251,12 +251,13 @@ class RecordingFile:
                 start_ns, end_ns, *_ = CHUNK.unpack(self._read(at + HEAD.size, CHUNK.size))
                 chunk = Chunk(start_ns, end_ns, at, end - at, channels, messages)
                 self.chunks.append(chunk)
-                if not channels or not channels <= self.channels.keys():  # else no channel in it is new
+                all_known = bool(channels) and channels <= self.channels.keys()  # no channels: an index is damaged
+                if not all_known:
                     self._learn(chunk)
             elif op == Op.METADATA:
                 self._metadata.append(at)
             elif op == Op.CHANNEL:
-                self._name(self._record(at), is_certain=False)  # it is outside of chunks
+                self._declare(self._record(at), is_certain=False)  # outside of chunks no checksum protects it
 
     def _learn(self, chunk: Chunk) -> None:
         """Note the channels that a chunk declares."""
@@ -302,15 +303,15 @@ class RecordingFile:
             if op == Op.MESSAGE:
                 yield data, begin, end
             elif op in (Op.SCHEMA, Op.CHANNEL):
-                self._name(record_of(data[begin - HEAD.size : end]))
+                self._declare(record_of(data[begin - HEAD.size : end]))
 
     def _unpacked_later(self, chunk: Chunk, chooses: Chooses) -> Iterator[Recorded]:
         yield from self._unpacked(chunk, chooses)[0]
 
-    def _name(self, record: McapRecord, *, is_certain: bool = True) -> None:
-        """Note a schema or channel.
+    def _declare(self, record: McapRecord, *, is_certain: bool = True) -> None:
+        """Note a schema or channel. Channels that were noted before keep their schema.
 
-        ``is_certain`` False: it was outside of chunks, where no checksum protects it, and replaces no other.
+        ``is_certain`` False: it was outside of chunks, where no checksum protects it; such a channel replaces no other.
         """
         from mcap.records import Channel as ChannelRecord
         from mcap.records import Schema as SchemaRecord

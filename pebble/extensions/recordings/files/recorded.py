@@ -76,7 +76,10 @@ class Damage:
             self.why = self.why or str(why)
 
     def report(self, *, active: bool = False) -> str:
-        """Return the damage in words; "" if there is none. A file that is ``active`` needs no end."""
+        """Return the damage in words; "" if there is none.
+
+        A file that is ``active`` (being written) needs no end. A file may also be written without that being known.
+        """
         reasons = [
             (len(self.parts), f"{len(self.parts):,} damaged parts"),
             (self.missing, f"{self.missing:,} messages missing"),
@@ -84,7 +87,7 @@ class Damage:
             (self.torn and not active, f"{self.torn:,} bytes at its end cannot be read"),
             (not (self.finished or active), "its end is missing or damaged, or it is being written"),
         ]
-        text = ", ".join(words for number, words in reasons if number)
+        text = ", ".join(words for is_there, words in reasons if is_there)
         return f"{text} ({self.why})" if text and self.why else text
 
 

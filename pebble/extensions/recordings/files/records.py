@@ -57,7 +57,7 @@ def records(data: bytes) -> Iterator[tuple[int, int, int]]:
 
 
 def unpack_chunk(data: bytes) -> bytes:
-    """Return the records of a chunk from its record. Raises DamageError if its checksum is wrong."""
+    """Return the records that the chunk ``data`` contains. Raises DamageError if its checksum is wrong."""
     from mcap.records import Chunk
     from mcap.stream_reader import get_chunk_data_stream
 
@@ -70,7 +70,7 @@ def unpack_chunk(data: bytes) -> bytes:
 
 
 def record_of(data: bytes) -> McapRecord:
-    """Return the parsed record. Raises DamageError, also if its lengths do not fit exactly, except for a chunk."""
+    """Return the parsed record. Raises DamageError, also for lengths that do not fit exactly (but not of a Chunk)."""
     from mcap.data_stream import RecordBuilder
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader

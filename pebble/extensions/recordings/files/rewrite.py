@@ -61,8 +61,8 @@ class Copy:
 
     def __init__(self, writer: RecordingWriter) -> None:
         self._writer = writer
-        self._channels: dict[tuple[object, ...], int] = {}
-        self._schemas: dict[Schema, int] = {}
+        self._channels: dict[tuple[object, ...], int] = {}  # their numbers in the file, by all that makes them differ
+        self._schemas: dict[Schema, int] = {}  # their numbers in the file
 
     def add(self, message: Recorded) -> None:
         channel = message.channel
@@ -73,6 +73,7 @@ class Copy:
         self._writer.add(number, message.log_ns, message.payload, message.publish_ns)
 
     def _declare(self, channel: Channel) -> int:
+        """Add a channel to the file, with its schema if that is new; return its number there."""
         if self._writer.channels == MOST_CHANNELS:
             raise RecordingError(f"{channel.topic}: one file has no room for more topics: choose a shorter time")
         schema, number = channel.schema, 0

@@ -92,8 +92,8 @@ class Scan:
         if op == Op.CHUNK:
             is_valid = self._is_chunk(at, length)
         elif op == Op.MESSAGE_INDEX:
-            entries = self._read(at + HEAD.size, _INDEX.size)
-            is_valid = length >= _INDEX.size and length == _INDEX.size + _INDEX.unpack(entries)[1]
+            index_head = self._read(at + HEAD.size, _INDEX.size)
+            is_valid = length >= _INDEX.size and length == _INDEX.size + _INDEX.unpack(index_head)[1]
         else:
             is_valid = self._is_exact(at, length)
         return Found(op, at, end) if is_valid else None

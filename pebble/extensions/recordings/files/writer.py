@@ -88,7 +88,7 @@ class RecordingWriter:
         named, self._new = self._new, []
         if self._log_ns >= self._names_again_ns:
             named, self._names_again_ns = self._named, self._log_ns + _NAMES_AGAIN_NS
-        if named and self.messages:  # without any message there is no chunk; the first one comes after all declarations
+        if named and self.messages:  # no message, no chunk; at the first message all channels are declared again
             self._output.write(_packed(named))
         self._writer.flush()
         self.indexed += len(self._used)
@@ -123,7 +123,7 @@ class _Output(BufferedIOBase):
 
 
 def _packed(channels: list[Channel]) -> bytes:
-    """Return the declarations of the channels without a schema, to repeat them where damage does not reach them.
+    """Return the declarations of those channels that have no schema, to repeat them where damage does not reach them.
 
     For other channels the schema would have to be repeated as well.
     """

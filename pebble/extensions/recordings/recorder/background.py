@@ -52,6 +52,7 @@ class Background:
             return_free_pages()
 
     def _sync(self, file: OpenFile) -> None:
+        """Sync a file to disk by a descriptor of its own, as the writer may close the file meanwhile."""
         try:
             descriptor = os.dup(file.file.fileno())
         except (OSError, ValueError):  # closed meanwhile

@@ -54,7 +54,7 @@ class Due:
     def every(self, what: str, seconds: float) -> bool:
         """True if the task ``what`` is due: ``seconds`` have passed since it was due last.
 
-        At its first call a task is due if this object is ``seconds`` old by then, else ``seconds`` after that call.
+        At a task's first call, this object must be ``seconds`` old; if it is not, ``seconds`` count from that call.
         """
         now = self._boot_ns()
         if now - self._done.get(what, self._began) < seconds * 1e9:

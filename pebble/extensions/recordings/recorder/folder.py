@@ -47,6 +47,7 @@ class Entry:
 
     @property
     def is_active(self) -> bool:
+        """True if it is being written, or its recorder was killed."""
         return self.path.name.endswith(ACTIVE)
 
     @property
@@ -60,7 +61,7 @@ class Folder:
     def __init__(self, root: Path) -> None:
         self.root = root
         self.is_locked = False  # also where there are no locks: another recorder may write here
-        self._number = 0
+        self._number = 0  # of the newest file
         self._lock = ExitStack()
         self._lock_file = OwnFile(root / LOCK)
 
@@ -97,12 +98,12 @@ class Folder:
 
     @classmethod
     def is_in_use(cls, root: Path) -> bool:
-        """True if a recorder writes in ``root``, or might without being noticed."""
+        """True if a recorder writes in ``root``, or if one may do so because the file system has no locks."""
         with as_owner(root):
             if not (root / LOCK).exists():
                 return False
             try:
-                with _locked(root / LOCK, "") as is_locked:
+                with _locked(root / LOCK, "") as is_locked:  # "": its error is caught here
                     return not is_locked
             except RecordingError:
                 return True

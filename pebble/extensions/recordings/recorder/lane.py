@@ -49,7 +49,7 @@ class OpenFile:
             self.discard()
             raise
         self._taken = 0  # written messages that :meth:`take_written` has returned
-        self._channels: dict[tuple[object, ...], int] = {}
+        self._channels: dict[tuple[object, ...], int] = {}  # their numbers in the file, by what their messages share
 
     @property
     def is_full(self) -> bool:

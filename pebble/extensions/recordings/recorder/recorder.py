@@ -86,7 +86,7 @@ class Recorder:
         if topic.startswith("$recorder/") or len(payload) > LARGEST_PAYLOAD:
             self.counters["refused"] += 1
         elif self.options.media or not is_media(payload):
-            self._intake.add(topic, payload, qos, retain, "1" if retained else "", source)
+            self._intake.add(topic, payload, qos, retain, "1" if retained else "", source)  # see Item.retained
 
     def forget_retained(self, source: str) -> None:
         """Forget the retained values of a connection, as they are fetched again."""

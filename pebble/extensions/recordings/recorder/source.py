@@ -38,7 +38,7 @@ class Source:
         self._lost_at = 0  # nanoseconds since 1970; 0: connected, or never was
         self._losses: dict[str, int] = {}  # messages that the transport dropped, by reason, as noted last
         self._fetching: _RetainedFetch | None = None
-        self._wants_fetch = self._was_connected = False
+        self._wants_fetch = self._was_connected = False  # retained messages are to be fetched; it was connected once
         self._transport = self._make()
 
     @property
@@ -66,6 +66,7 @@ class Source:
             self._transport.close()
             self._is_modern = False
             self._transport = self._make()
+            self._losses.clear()  # the new one counts from zero
             self._open(0.0)
         fetching = self._fetching
         if fetching is not None and (fetching.is_done or self._wants_fetch):
@@ -120,6 +121,7 @@ class Source:
     def _receive(self, message: Message) -> None:
         if message.topic.startswith(self._ignored):
             return
+        # With as_published the flag says nothing, but the broker was told to send no old values, see _make.
         is_live = self._transport.as_published or not message.retain
         if is_live:
             self._recorder.receive(

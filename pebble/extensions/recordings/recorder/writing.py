@@ -53,14 +53,14 @@ class Context(NamedTuple):
 
 
 class Writing:
-    """A writer of a recorder's messages. Not thread-safe."""
+    """A writer of a recorder's messages, each into the file of its lane (see .lane). Not thread-safe."""
 
     def __init__(self, context: Context, intake: Intake, background: Background) -> None:
         self._folder, self._options, self._clock, self._counters, about = context
         self._intake = intake
         self._files = OpenFiles(self._folder, about, background.watch)
         self._finisher = Finisher(background, self._intake.note, self._note_finished)
-        self._blocked: _Blocked | None = None
+        self._blocked: _Blocked | None = None  # why nothing can be written now
         self._lacking: list[Item] = []  # what no file has taken; bounded: a second of messages
         self._noted_drops = 0  # messages that were dropped, as recorded last
         self._changed = False  # files were finished since the folder was listed
@@ -73,7 +73,7 @@ class Writing:
     def mend_leftovers(self) -> int:
         """Finish the files that an earlier recorder has left; return their number.
 
-        Without a lock they may be another recorder's; then they stay as they are.
+        Where the folder cannot be locked, a recorder that runs may still write them: then they stay as they are.
         """
         open_paths = {file.path for file in self._files.by_lane.values()}
         leftovers = [entry.path for entry in self._folder.entries() if entry.is_active and entry.path not in open_paths]
@@ -132,7 +132,7 @@ class Writing:
             self._flush(lane, file)
 
     def rotate(self, *, all_of_them: bool = False) -> None:
-        """Finish the files that are old, large or idle."""
+        """Finish the files that are old or large, and those of media that are idle; or ``all_of_them``."""
         now_ns = self._clock.now()
         for lane, file in self._files.by_lane.items():
             old = now_ns - file.began_ns > self._options.rotate_seconds * 1e9

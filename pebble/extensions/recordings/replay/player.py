@@ -98,7 +98,7 @@ class Reading:
 
     def __init__(self, source: Source, publishes: Chooses, until_ns: int) -> None:
         self.next: Recorded | None = None
-        self.state: list[Recorded] = []  # to be sent before the next message, the last one first
+        self.state: list[Recorded] = []  # to be sent before the next message; in reverse, the last entry first
         self.skipped = 0
         self._source, self._publishes, self._until_ns = source, publishes, until_ns
         self._messages: Iterator[Recorded] = iter(())
@@ -220,7 +220,7 @@ class Player:
         self.ended = True
 
     def _open(self, since_ns: int, position_ns: int = 0) -> None:
-        """Continue with the messages from ``since_ns``, at ``position_ns``; 0: at the first of them."""
+        """Read the messages from ``since_ns`` on, and play from ``position_ns``; 0: from the first message's time."""
         self.at_end = False
         self._reading.open(since_ns)
         if position_ns:
@@ -234,8 +234,8 @@ class Player:
         now, reading = self._now(), self._reading
         if now - self._waited_at > _TICK_S:  # also if messages are due all the time, ``wait`` may pause or stop this
             self._pass(0.0)
-        elif reading.state:
-            if self._send(reading.state[-1], self._pace.from_ns):  # the last one comes first
+        elif reading.state:  # also while paused, so that a move is shown at once
+            if self._send(reading.state[-1], self._pace.from_ns):  # the list is in reverse: its last entry is due first
                 reading.state.pop()
         elif self.paused:
             self._output.halt()

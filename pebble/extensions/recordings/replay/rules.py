@@ -70,7 +70,7 @@ class Rules:
     def __init__(self, options: Options, channels: Iterable[Channel]) -> None:
         """Check the options. ``channels``: the recording's. Raises ReplayError, ConfigError or TransportError."""
         self._options = options
-        Identity(options.system, "robots", "any")
+        Identity(options.system, "robots", "any")  # raises if topics cannot begin with that system
         for filter_ in options.only:
             check_filter(filter_)
         self._remembered_address = lru_cache(maxsize=65_536)(self._find_address)
@@ -99,7 +99,7 @@ class Rules:
         return Outgoing(Message(address.topic, shifted(payload, by_ns), address.qos), moves)
 
     def _listed(self, channel: Channel) -> _Address | None:
-        """Return the channel's address; None if it is not published, or if its robot is none of :attr:`robots`."""
+        """Return how the channel's messages are published; None if they are not, or its robot is not in ``robots``."""
         address = self._address(channel)
         return address if address is not None and address.base in self.robots else None
 
@@ -108,7 +108,7 @@ class Rules:
         return self._remembered_address(channel.topic, metadata.get("qos", "0"), metadata.get("retained") == "1")
 
     def _find_address(self, topic: str, qos: str, retained: bool) -> _Address | None:
-        """Return the address for messages of a topic; None if none is to be published.
+        """Return how messages of a topic are published; None if none is to be published.
 
         ``retained``: the recorder received them as old ones.
         """
@@ -202,7 +202,7 @@ def _rebased(plain: Any, old: str, new: str) -> Any:
 
 
 def _is_elsewhere(key: str, value: Any, below: str) -> bool:
-    """True if ``value``, by ``key`` or form, is a topic that does not begin with ``below``: configs may set such."""
+    """True if ``value`` is a topic that does not begin with ``below``: by its form, or as ``key`` ends with topic."""
     if not isinstance(value, str):
         return False
     return not value.startswith(below) and (key.endswith("topic") or parse_topic(value) is not None)

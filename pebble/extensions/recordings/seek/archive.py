@@ -32,7 +32,7 @@ class _Named(NamedTuple):
     """A file, and the facts in its name if a recorder has named it."""
 
     path: Path
-    lane: str  # "": any
+    lane: str  # what the file holds, see recorder.lane; "": anything
     begins_ns: int  # 0: not known
 
 
@@ -41,8 +41,8 @@ class Archive:
 
     def __init__(self, *places: Path) -> None:
         self._places = places
-        self._named: list[_Named] = []
-        self._listed_at = float("-inf")
+        self._named: list[_Named] = []  # the files in these places
+        self._listed_at = float("-inf")  # when they were last listed
         self._open: dict[Path, RecordingFile] = {}
         self._failed: dict[Path, str] = {}  # why a file cannot be opened
 
@@ -109,7 +109,7 @@ class Archive:
         """Return the time of the first message of the robot from ``at_ns`` on; None if there is none."""
         earliest_ns = FOREVER_NS
         for file in self.files(robot, at_ns, FOREVER_NS):
-            if file.first_ns >= earliest_ns:
+            if file.first_ns >= earliest_ns:  # and so are all that follow, in the order of time
                 break
             first = next(_new_messages(file, robot, at_ns, earliest_ns), None)
             if first is not None:
@@ -168,6 +168,8 @@ class Archive:
             file.refresh()
         except (PebbleError, OSError) as error:
             self._failed[path] = str(error).removeprefix(f"{path}: ")
+            if file is not None:
+                file.close()
             return None
         self._failed.pop(path, None)
         self._open[path] = file  # the last one used is the last one closed

@@ -62,6 +62,7 @@ class Days:
             with suppress(OSError):  # it is deleted by now
                 about = path.stat()
                 name, ms = _day_of(int(about.st_mtime)), about.st_mtime * 1e3
+                # A day that has no other file gets the size and the time of this one.
                 day = by_name.setdefault(name, Day(name, bytes=about.st_size, first=ms, last=ms))
                 day.unread.append(f"{path.name}: {why}")
         return sorted(by_name.values(), key=lambda day: day.day, reverse=True)

@@ -151,10 +151,11 @@ def _legend(axes: Axes) -> None:
 
 
 def _scale_counts(axes: Axes, counts: Sequence[float]) -> None:
+    """Scale the axis of counts: logarithmic if the largest is far above the smallest, else in whole numbers."""
     present = [count for count in counts if count > 0]
     if max(present) > _TALL * min(present):
         axes.set_yscale("log")
-        axes.set_ylim(bottom=0.7)
+        axes.set_ylim(bottom=0.7)  # below 1, so that a count of 1 is seen
         axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     else:
         axes.locator_params(axis="y", integer=True, min_n_ticks=1)

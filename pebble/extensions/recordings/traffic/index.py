@@ -135,18 +135,18 @@ class _Rows:
     def __init__(self, connection: DuckDBPyConnection) -> None:
         connection.execute(_TABLES)
         self._connection = connection
-        self._count = 0
-        self._batch: list[tuple[int, ...]] = []
+        self._count = 0  # of rows in the tables
+        self._batch: list[tuple[int, ...]] = []  # rows that are not in the tables yet
         self._activities: dict[int, Callable[[bytes], Activity]] = {}  # by channel
-        self._heartbeats: set[int] = set()
+        self._heartbeats: set[int] = set()  # the channels with heartbeats
 
     def read(self, recording: Path, advance: Advance) -> tuple[int, str]:
-        """Read the recording; return the number of missing messages and the damage. Raises RecordingError."""
+        """Read the recording; return how many messages the index lacks, and why. Raises RecordingError."""
         with RecordingFile(recording) as file:
             damage, expected = file.damage, 0 if file.statistics is None else file.statistics.message_count
             for message in file.read():
                 if message.log_ns > _LATEST_NS:
-                    damage.missing += 1
+                    damage.missing += 1  # the index cannot store it
                     damage.why = "times after 2262"
                 elif message.channel.topic == EVENTS:
                     self._add_event(message)
@@ -155,7 +155,7 @@ class _Rows:
                 if len(self._batch) >= _BATCH:
                     self._flush()
                     advance(min(1.0, self._count / expected) if expected else 0.5)
-            unread = file.problem
+            unread = file.problem  # the damage in words
         self._flush()
         advance(1.0)
         return damage.missing, unread
@@ -188,7 +188,7 @@ class _Rows:
             self._heartbeats.add(channel.id)
         metadata = channel.metadata
         qos = {"1": 1, "2": 2}.get(metadata.get("qos", ""), 0)
-        flags = [metadata.get(name, "0") not in ("", "0") for name in ("retain", "retained")]
+        flags = [metadata.get(name, "0") not in ("", "0") for name in ("retain", "retained")]  # see COLUMNS
         self._connection.execute(
             "INSERT INTO channels VALUES (?, ?, ?, ?, ?, ?, ?)", [channel.id, robot, direction, metric, qos, *flags]
         )

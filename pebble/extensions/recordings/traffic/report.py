@@ -60,7 +60,8 @@ def write_report(
         folder.mkdir(parents=True, exist_ok=True)
         page = folder / NAME
         page.write_text(_page(traffic, advance), encoding="utf-8")
-        return [page, *(write_csv(table, folder) for table in tables(traffic) if csv)]
+        csv_files = [write_csv(table, folder) for table in tables(traffic)] if csv else []
+        return [page, *csv_files]
     except OSError as error:
         raise PebbleError(f"{folder}: {error.strerror}") from None
 
@@ -140,17 +141,18 @@ def _figure(figure: Figure, robot: RobotTraffic) -> str:
 
 def _table(table: Table) -> str:
     heads = "".join(f"<th{_class(number)}>{escape(title)}</th>" for number, (_, title) in enumerate(table.columns))
-    rows = "".join(
-        f"<tr>{''.join(f'<td{_class(number)}>{_formatted(value)}</td>' for number, value in enumerate(row))}</tr>"
-        for row in table.rows
-    )
+    rows = []
+    for row in table.rows:
+        cells = "".join(f"<td{_class(number)}>{_formatted(value)}</td>" for number, value in enumerate(row))
+        rows.append(f"<tr>{cells}</tr>")
     return (
         f'<h2>{escape(table.title)}</h2><div class="scroll"><table><thead><tr>{heads}</tr></thead>'
-        f"<tbody>{rows}</tbody></table></div>"
+        f"<tbody>{''.join(rows)}</tbody></table></div>"
     )
 
 
 def _class(column: int) -> str:
+    """Return the attribute for cells of a column: the first one holds text."""
     return "" if column else ' class="text"'
 
 

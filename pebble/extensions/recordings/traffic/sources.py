@@ -50,7 +50,8 @@ def sources(places: Iterable[Path], scratch: Path, progress: Progress = lambda _
             if facts is not None:
                 indexed.indexes.append(path)
                 indexed.missing += facts.missing
-                indexed.unread += [f"{facts.recording}: {facts.unread}"] if facts.unread else []
+                if facts.unread:
+                    indexed.unread.append(f"{facts.recording}: {facts.unread}")
         if indexed.indexes:
             names = f"SELECT DISTINCT robot FROM {parquet(indexed.indexes)} WHERE robot <> '' ORDER BY robot"
             indexed.robots = [robot for (robot,) in connection.execute(names).fetchall()]

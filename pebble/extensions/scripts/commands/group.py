@@ -14,6 +14,7 @@ from pebble.contract.payloads import AutonomyStatus
 from pebble.errors import PebbleError, TransportError
 from pebble.extensions.operator.client import forms
 from pebble.extensions.operator.client.connection import Target, connected, put_account_into_topics, target_of, wait_for
+from pebble.extensions.operator.client.driveable import doubt_of
 from pebble.extensions.operator.client.names import id_of
 from pebble.extensions.operator.client.scripts import RobotScripts, options_of
 from pebble.extensions.operator.commands.options import RobotArgument
@@ -61,7 +62,7 @@ def list_(robot: RobotArgument, *, target: Target) -> int:
             for setting in forms.listed(entry.get("configs")):
                 _print(f"    {_option(setting)}")
         if scripts.status is not None:
-            _print_status(scripts.status)
+            _print_status(scripts.status, scripts)
     return 0
 
 
@@ -96,11 +97,11 @@ def start(
 
         wait_for(is_answered, scripts.answer_s)
         status = scripts.status
-        if scripts.answers == answers_before or status is None:
+        if scripts.answers == answers_before or status is None:  # a status that is no answer is judged below
             raise PebbleError(f"no answer within {scripts.answer_s:g} s: is the robot up?")
         if not _runs(before, status, file):
             raise PebbleError(shown(status.error or f"{file} does not run"))
-        _print_status(status)
+        _print_status(status, scripts)
         wait_for(lambda: _ended(scripts.status), _FIRST_SECOND_S)
         if scripts.status is not None and _ended(scripts.status) and scripts.status.error:
             raise PebbleError(shown(scripts.status.error))
@@ -117,7 +118,7 @@ def stop(robot: RobotArgument, *, target: Target) -> int:
             raise PebbleError(
                 f"it is not known to have stopped within {scripts.answer_s:g} s: pebble estop stops the robot"
             )
-        _print_status(scripts.status)
+        _print_status(scripts.status, scripts)
     return 0
 
 
@@ -167,7 +168,7 @@ def _require_sent(transport: Transport, accepted: bool) -> None:
         raise TransportError(f"nothing was sent: {transport.problem or 'the connection was lost'}")
 
 
-def _print_status(status: AutonomyStatus) -> None:
+def _print_status(status: AutonomyStatus, scripts: RobotScripts) -> None:
     if status.running:
         waits = ", but a person drives: it waits" if status.overridden is True else ""
         _print(f"{status.file} runs (process {status.pid}){waits}")
@@ -175,6 +176,8 @@ def _print_status(status: AutonomyStatus) -> None:
             _print(f"    {key}: {value}")
         for other in status.dependencies:
             _print(f"    with {other.file}" + (f" (process {other.pid})" if other.running else ", which does not run"))
+        if doubt := doubt_of(scripts.robot.driveable):
+            _print(f"{scripts.robot.name}: {doubt}")
     else:
         _print("no script runs")
     if status.error:

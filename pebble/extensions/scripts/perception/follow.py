@@ -101,7 +101,7 @@ class Follower:
     def __init__(self, settings: FollowSettings) -> None:
         self.settings = settings
         self._pulses = Pulses()
-        self._seen_at = self._side_since = float("-inf")
+        self._seen_at = self._side_since = float("-inf")  # when the tag was last seen; since when ``_side`` is so
         self._side = 1.0  # the side on which the tag was seen last, and to which the search turns: right is positive
         self._last = Command()
         self._holding = False  # the wanted distance is reached
@@ -121,6 +121,7 @@ class Follower:
             return self._turn(now, place.angle_rad)
         too_far_m = place.distance_m - self.settings.target_distance_m
         threshold_m = self.settings.distance_threshold_m
+        # It must come nearer to begin holding than to go on holding, so that small errors do not move it to and fro.
         tolerance_m = threshold_m + self.settings.standoff_hysteresis_m if self._holding else _ARRIVED * threshold_m
         self._holding = abs(too_far_m) <= tolerance_m
         if not self._holding:
@@ -161,11 +162,12 @@ class Follower:
         return self._search(now)
 
     def _search(self, now: float) -> Command:
+        """Turn to the side where the tag was seen last, and after ``search_reverse_after_s`` to the other one."""
         settings = self.settings
         reverse_s = settings.search_reverse_after_s
         if reverse_s > 0.0 and now - self._side_since > reverse_s:
             self._side = -self._side
             self._side_since = now
-        # A pulse lasts for one or two commands: with more power one could turn past all that the camera sees.
+        # A pulse lasts for one or two commands: with more power it could turn the robot past more than its camera sees.
         x = self._pulses.turn(self._side * settings.turn_power, settings.turn_pulse_s, settings.search_pause_s, now)
         return Command(x, 0.0, "search")

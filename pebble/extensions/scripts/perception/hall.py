@@ -50,7 +50,7 @@ class SensorRange:
         return self.high - self.low >= _SMALLEST_SWING
 
     def update(self, value: float) -> None:
-        """Add a value. A clear turn of the signal away from its farthest value ends a half wave."""
+        """Add a value. A half wave has ended once the signal has gone back clearly from its farthest value."""
         if not self._started:
             self._started = True
             self.low = self.high = self._pivot = value
@@ -128,8 +128,8 @@ class PhaseTracker:
     def _predict(self, power: float) -> float:
         """Return the phase that this sample should add: by the power, and by the measured speed if that agrees.
 
-        If the expected direction changes, the phase may go back from now on: its limit, the farthest phase reached,
-        is set to the present one.
+        If the expected direction changes, the phase may go back from now on: the farthest phase reached, behind which
+        it must not go, is set to the present one.
         """
         before = self._expected
         mean_power = (self._power + power) / 2  # a command comes between two samples
@@ -213,7 +213,7 @@ class HallWheel:
                 self._replay(self._warm_up)
                 return self.mm - before
             self._bound_warm_up(self._warm_up)
-        if self._range.extrema:
+        if self._range.extrema:  # else the range is unknown: the replay at the first extremum adds the sample
             self._add(sample, self._tracker, self._counts)
         return self.mm - before
 
@@ -251,14 +251,17 @@ class HallWheel:
             added = tracker.update_pair(math.atan2(level, -second), sample.power)
         else:
             added = tracker.update(level, sample.power)
-            if sample.direction == 0:
+            if sample.direction == 0:  # which one sensor alone does not show
                 counts.unknown_rad += abs(added)
                 return
         counts.rad += added
         counts.rad_in_any_direction += abs(added)
 
     def _sign_of_second(self, samples: list[HallSample]) -> int:
-        """Return the factor that lets the second sensor's level agree with the commands: 1 or −1; 0 if neither does."""
+        """Return the factor that lets the second sensor's level agree with the commands: 1 or −1; 0 if neither does.
+
+        Also 0 after less motion than half a wave, which shows too little.
+        """
         if not self._second.swings or self._second.extrema < 1:
             return 0
         agreed = 0.0  # the motion in the commanded direction; against it: negative
@@ -268,6 +271,7 @@ class HallWheel:
         for sample in samples:
             if sample.quadrature is None:
                 return 0
+            # With the factor 1 the first level is the sine of the phase, and the second one, behind it, −cosine.
             phase = math.atan2(self._range.level(sample.value), -self._second.level(sample.quadrature))
             if sample.direction != last_direction:
                 total, since_change = total + abs(since_change), 0.0

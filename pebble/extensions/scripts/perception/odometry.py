@@ -69,7 +69,7 @@ class OdometrySettings(Struct, frozen=True, kw_only=True):
 
 
 def calibrated(settings: OdometrySettings, calibration: Calibration) -> OdometrySettings:
-    """Return the settings with measured values in place of those that have their defaults."""
+    """Return the settings with the measured values, but keep each value that the user has changed from its default."""
     default = OdometrySettings()
     if settings.step_mm == default.step_mm:
         steps = {"left_mm_per_event": calibration.left_step_mm, "right_mm_per_event": calibration.right_step_mm}
@@ -196,6 +196,7 @@ class Odometry:
         """Add a sample of the hall sensors."""
         self._samples += 1
         settings, (left, right) = self._settings, self._directions.at(now)
+        # Only the left wheel may have a second sensor.
         left_second = None if settings.second_channel == "none" else getattr(values, settings.second_channel)
         left_value, right_value = getattr(values, settings.left_channel), getattr(values, settings.right_channel)
         left_mm = self._left.update(HallSample(left_value, left_second, left.power, left.direction), now)
@@ -214,7 +215,7 @@ class Odometry:
         self.pose = part.end(self._base)
         is_ready = self._left.hall.ready and self._right.hall.ready
         if is_ready:  # no warm-up of a sensor can correct the part any more
-            if self.moving(now) or not self._was_ready:  # at rest it is noise, unless a warm-up has just ended
+            if self.moving(now) or not self._was_ready:  # at rest it is noise; after a warm-up, the whole way
                 self.distance_mm += abs(part.ahead_mm)
             self._base, self._part = self.pose, _Part()
         self._was_ready = is_ready

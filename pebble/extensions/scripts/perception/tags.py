@@ -115,12 +115,14 @@ class TagFinder:
 
 
 def _checked(picture: Any) -> Any:
+    """Return a picture in the form that OpenCV takes. Raises PebbleError for anything else."""
     if not isinstance(picture, np.ndarray):
         raise PebbleError(f"{_PICTURE}, not {type(picture).__name__}")
     if picture.dtype != np.uint8:
         raise PebbleError(f"{_PICTURE}, not of {picture.dtype}")
+    colours = picture.shape[2:]  # (3,) for colours, () for grey
     if not (picture.ndim == 2 or (picture.ndim == 3 and picture.shape[2] == 3)) or not picture.size:
-        raise PebbleError(f"{_PICTURE}, not of {picture.shape}{_HINTS.get(picture.shape[2:], '')}")
+        raise PebbleError(f"{_PICTURE}, not of {picture.shape}{_HINTS.get(colours, '')}")
     return np.ascontiguousarray(picture)
 
 

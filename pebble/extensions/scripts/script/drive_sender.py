@@ -37,10 +37,10 @@ class DriveSender:
         self.run = run
         self._publish = publish
         self._tried = False  # the script has commanded anything: scripts that never do are not ended
-        self._pending: Drive | None = None
+        self._pending: Drive | None = None  # the command that waits for its turn
         self._turn = float("-inf")  # when the next command may be published
         self._zero_is_last = False  # the newest accepted command is a zero
-        self._person_at = float("-inf")
+        self._person_at = float("-inf")  # when a person last commanded
         self._latched: EstopState | None = None  # of the owner that was stopped last
         self._owners: dict[str, EstopState] = {}  # the newest state of each
         self._barred_at: float | None = None  # when an owner first said that it refuses this run for good
@@ -81,7 +81,7 @@ class DriveSender:
             self._send(replace(_ZERO, source=SCRIPT, run=self.run), now)
 
     def tick(self, now: float) -> None:
-        """Publish the command that waits for its turn, unless it has become refused."""
+        """Publish the command that waits for its turn; drop it if it moves the robot and there is a :meth:`refusal`."""
         if self._pending is None or now < self._turn:
             return
         pending, self._pending = self._pending, None
@@ -107,8 +107,8 @@ class DriveSender:
         latched = [state for state in states.values() if state.latched]
         self._latched = max(latched, key=lambda state: state.since, default=None)
         last_barred = [state.last_barred for state in states.values()]
-        barring = [run for run in last_barred if not newer(self.run, run)]  # not below this run: they bar it, too
-        if any(run != self.run for run in barring):  # one above it is barred: so a newer run has begun
+        barring = [run for run in last_barred if not newer(self.run, run)]  # this one or newer: they bar it
+        if any(run != self.run for run in barring):  # a newer one is barred: so it has begun
             self._superseded = True
         elif barring and self._barred_at is None:
             self._barred_at = now
@@ -134,7 +134,7 @@ class DriveSender:
         if not self._end and self._tried:
             if self._superseded:
                 self._end = SUPERSEDED
-            elif self._barred_at is not None and now >= self._barred_at + _GRACE_S:  # it was a person
+            elif self._barred_at is not None and now >= self._barred_at + _GRACE_S:  # no newer run: a person barred it
                 self._end = "stopped by an operator"
         return self._end
 
@@ -147,7 +147,7 @@ class DriveSender:
         return min(times, default=None)
 
     def _compare(self, owner: str, before: EstopState | None, now: EstopState) -> None:
-        """End this run if an owner's states show an emergency stop or a restart, which forgets what it barred."""
+        """End this run if an owner's states show an emergency stop, or a restart: the owner may forget barred runs."""
         if self._end or before is None:
             return
         if before.boot != now.boot:

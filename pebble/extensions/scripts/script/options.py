@@ -70,6 +70,7 @@ class OneLineParser(argparse.ArgumentParser):
 
 
 def _setting(field: inspect.Field, hint: Any) -> Setting:
+    """Return the setting that a field declares; ``hint``: its type as written. Raises TypeError."""
     kind, meta, is_optional = _plain(field.type, field.name)
     name, type_ = field.encode_name, _kind(kind, field.name)
     option = meta.get("arg", name.replace("_", "-"))

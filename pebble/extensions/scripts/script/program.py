@@ -110,7 +110,10 @@ def _describe(
     *,
     drives: bool,
 ) -> None:
-    """Print the form that operators see. ``first``: the options that they see first."""
+    """Print the form that operators see.
+
+    ``words``: the script's label and summary. ``first``: the options that they see first, main_options of :func:`run`.
+    """
     settings = [] if options is None else form(options)
     keys = [setting.key for setting in settings]
     unknown = [key for key in first if key not in keys]
@@ -192,7 +195,7 @@ def _connected(config: Config, path: Path) -> Transport:
     """Return the open local transport. Raises PebbleError that names what is missing, for a script run in a shell."""
     transport = local_transport(config, f"script-{os.getpid()}")
     transport.open(_CONNECT_S)
-    if transport.state is not State.CONNECTED and RUN not in os.environ:
+    if transport.state is not State.CONNECTED and RUN not in os.environ:  # RUN: the manager of scripts sets it
         why = transport.problem or f"no answer within {_CONNECT_S:g} s"
         transport.close()
         raise TransportError(f"{config.identity.id} is not up ({why}): start it with `pebble up {path}`")
@@ -204,7 +207,7 @@ def _connected(config: Config, path: Path) -> Transport:
 def _numbered(config: Config) -> Callable[[int], int]:
     """Return a function that gives this run its number. Raises ConfigError.
 
-    A manager that starts the script has chosen it; else it is a new one, above the function's argument.
+    If a manager started the script, the manager has chosen it; else it is a new one, above the function's argument.
     """
     text = os.environ.get(RUN)
     if text is None:

@@ -108,14 +108,14 @@ class Robot:
         self._refusals = Refusals(RateLimitedLog(self.log), Counters())
         self._transport, self._addresses, self._clock = transport, Addresses(config), clock
         self._latest = _Latest(self._subscribe, clock)
-        self._last_values: dict[Channel, Callable[[], Any]] = {}
+        self._last_values: dict[Channel, Callable[[], Any]] = {}  # by :meth:`publish_at_end`
         self._neighbours: dict[str, Neighbour] = {}
         self._pictures = Pictures(config.run_dir())
         self._publishing = threading.RLock()  # the last values are published after all others, before disconnecting
         self._stopped = threading.Event()
         self._drives = drives
-        self._exit_code = 0
-        self._pid = os.getpid()
+        self._exit_code = 0  # with which Stopped ends the script
+        self._pid = os.getpid()  # no forked process may use the robot
         self._wheels = Wheels(transport, self._addresses, number, on_ended or self._end_run, clock)
 
     # -- to see
@@ -215,7 +215,7 @@ class Robot:
     # -- its end
 
     def end(self, why: str, exit_code: int = 0) -> None:
-        """Publish the final stop and close the cameras; every later call raises Stopped. From any thread."""
+        """Publish the final zero and close the cameras; every later call raises Stopped. From any thread."""
         if os.getpid() != self._pid:  # a forked copy of the script's process
             return
         if not self._stopped.is_set():  # the first end decides

@@ -12,13 +12,13 @@ from msgspec import UNSET
 from pebble.contract import CAPABILITIES, CONTROL, CONTROL_STATE, codec
 from pebble.contract.payloads import ControlRequest, ControlState, LinkState
 from pebble.extensions.operator.client.control import ASKS_S, ControlClient, RobotControl
-from pebble.extensions.operator.client.driveable import driveable_of
+from pebble.extensions.operator.client.driveable import doubt_of, driveable_of, is_cut_off
 from pebble.extensions.operator.client.estop_states import MAX_OWNERS, Reset, RobotEstop
 from pebble.extensions.operator.client.pace_of_link import WIDE, pace_of
 from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.transports import Message
 from tests.ext.operator.client.estop_robot import KeepingRobot, Robot, capabilities, outgoing
-from tests.support import cases
+from tests.support import ROOT, cases
 
 GOOB = "pebble/robots/goob"
 STEP_S = 0.05
@@ -391,16 +391,21 @@ WHY = "serial: no /dev/ttyACM0"
 
 
 @pytest.mark.parametrize(
-    ("driveable", "doubt"),
+    ("driveable", "driven", "stopped"),
     [
-        ({"state": "no", "why": WHY}, f"CANNOT BE DRIVEN OR STOPPED: {WHY}"),
-        ({"state": "unknown", "why": WHY}, f"not known whether its motors obey: {WHY}"),
-        ({"state": "no", "why": "x" * 9000}, f"CANNOT BE DRIVEN OR STOPPED: {'x' * 300}"),
-        ({"state": "yes"}, ""),
-        (None, None),  # an older robot
-        ({"state": ["no"]}, None),
+        ({"state": "no", "why": WHY}, f"Cannot be driven: {WHY}", f"nothing confirms that its motors stand: {WHY}"),
+        ({"state": "unknown"}, "Not known whether it can be driven", "it is not known whether its motors stand"),
+        ({"state": "no", "why": "x" * 9000}, f"Cannot be driven: {'x' * 300}", None),
+        ({"state": "yes"}, "", ""),
+        (None, "", ""),  # an older robot
+        ({"state": ["no"]}, "", ""),
     ],
 )
-def test_a_status_tells_whether_a_robot_can_be_driven(driveable: object, doubt: str | None) -> None:
+def test_a_status_tells_in_the_words_of_the_page_whether_a_robot_can_be_driven(
+    driveable: object, driven: str, stopped: str | None
+) -> None:
     found = driveable_of(json.dumps({"t": 1, "value": {"services": {}, "driveable": driveable}}).encode())
-    assert (found and found.doubt) == doubt
+    assert doubt_of(found) == driven
+    assert stopped is None or doubt_of(found, stopped=True) == stopped
+    assert is_cut_off(found) is driven.startswith("Cannot")
+    assert driven.partition(":")[0] in (ROOT / "pebble/extensions/page/static/ui/fleet/doubt.js").read_text()

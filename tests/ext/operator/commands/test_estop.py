@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import pty
+import re
 import signal
 import threading
 import time
@@ -89,13 +90,43 @@ def test_a_stop_is_confirmed_by_every_owner(run: Run, robot_on: Make, url: str, 
     assert second[2]["valid_ms"] == 0
 
 
-def test_a_stop_of_a_robot_that_cannot_be_driven_is_reported_with_that(run: Run, robot_on: Make, url: str) -> None:
-    robot = robot_on("base")
-    driveable = {"state": "no", "why": "serial: no board\x1b[2J"}
-    robot.publish("status", {"value": {"services": {}, "driveable": driveable}}, retain=True)
-    assert run("estop", robot.id, url) == 0
-    assert "stopped and confirmed" in run.out
-    assert "CANNOT BE DRIVEN OR STOPPED: serial: no board\\u001b[2J" in run.out
+WHY = "serial: no board\\u001b[2J"
+STANDS = f"nothing confirms that its motors stand: {WHY}"
+#: What a robot says of its motors, and what a stop, the status after it, and the reset say: exit code, last line.
+MOTORS: dict[str, list[tuple[int, str]]] = {
+    "no": [
+        (1, f"latched, confirmed by left, right after T; {STANDS}"),
+        (0, STANDS),
+        (0, f"free; its status says: Cannot be driven: {WHY}"),
+    ],
+    "unknown": [
+        (0, f"stopped and confirmed after T; it is not known whether its motors stand: {WHY}"),
+        (0, f"it is not known whether its motors stand: {WHY}"),
+        (0, f"free; its status says: Not known whether it can be driven: {WHY}"),
+    ],
+    "yes": [
+        (0, "stopped and confirmed after T"),
+        (0, "stopped by me (right)"),
+        (0, "free; it moves again once drive commands have paused for half a second"),
+    ],
+}
+
+
+@pytest.mark.parametrize("every", [False, True])
+@pytest.mark.parametrize("state", MOTORS)
+def test_a_stop_and_a_reset_say_whether_they_reach_the_motors(
+    run: Run, robot_on: Make, url: str, state: str, every: bool
+) -> None:
+    robot = robot_on("left", "right")
+    robot.start()
+    robot.publish("status", {"value": {"driveable": {"state": state, "why": "serial: no board\x1b[2J"}}}, retain=True)
+    codes = []
+    for words in (["--all"] if every else [robot.id]), ["status", robot.id], ["reset", robot.id]:
+        code, lines = run("estop", *words, url), [line for line in run.out.splitlines() if robot.id in line]
+        last = re.sub(r", [^,]* ago", "", re.sub(r"\d\.\d\d s", "T", lines[-1].partition(": ")[2]))
+        assert not any("stopped and confirmed" in line for line in lines[:-1])
+        codes.append((code, last.replace(estop.me()[:32], "me")))
+    assert codes == MOTORS[state]
 
 
 def test_a_robot_that_does_not_answer_is_reported_and_ctrl_c_ends_it(robot_on: Make, url: str) -> None:
@@ -205,6 +236,8 @@ KEPT = {
     "capabilities of a stranger, on a page": ("pebble/robots/attic", "capabilities", ("page", "")),
     "capabilities of a stranger, in its status": ("pebble/robots/attic", "capabilities", ("estop", "status", "{id}")),
     "capabilities of a stranger, at its reset": ("pebble/robots/attic", "capabilities", ("estop", "reset", "{id}")),
+    "its own status": ("", "status", ("estop", "{id}")),
+    "its own status, at its reset": ("", "status", ("estop", "reset", "{id}")),
 }
 
 

@@ -99,7 +99,7 @@ def test_its_stop_is_a_form_that_the_server_takes(browser: Browser, served: Serv
         assert opened.until(_SHOWS)
         opened.page.get_by_role("button", name="STOP ALL").click()
         assert opened.until(lambda: robot.latched)
-        assert opened.until("document.body.innerText.includes('Confirmed by')")
+        assert opened.until("document.body?.innerText.includes('Confirmed by')")
         assert opened.violations == []
 
 

@@ -107,10 +107,13 @@ def test_by_default_it_is_harmless_and_current(
     assert len(operator.of(STATUS)) == 1
 
 
-def test_ctrl_c_leaves_nothing_that_moves(tmp_path: Path, operator: Reference, at: tuple[str, str]) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_orderly_end_leaves_nothing_that_moves(
+    tmp_path: Path, operator: Reference, at: tuple[str, str], number: signal.Signals
+) -> None:
     process = program("replay", walk(tmp_path), *at, "--incoming")
     assert until(lambda: len(operator.of(LOGS)) > 2)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     assert (process.communicate(timeout=WAIT_S)[1], process.returncode) == ("", 0)
     assert until(lambda: states(operator)[-1] is False)
     assert json.loads(operator.of(f"{REPLAYED}/incoming/drive-values")[-1])["valid_ms"] == 0

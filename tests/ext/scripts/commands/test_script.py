@@ -15,8 +15,8 @@ from typing import Any
 
 import pytest
 
-from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, WHEEL_ODOMETRY, Channel, codec
-from pebble.contract.payloads import AutonomyFiles, AutonomyStatus, WheelOdometry
+from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, STATUS, WHEEL_ODOMETRY, Channel, codec
+from pebble.contract.payloads import AutonomyFiles, AutonomyStatus, Status, WheelOdometry
 from pebble.errors import PebbleError
 from pebble.extensions.lab.simulation.world.script_robot import SimulatedRobot
 from pebble.extensions.operator.client.scripts import settings
@@ -50,6 +50,10 @@ class Manager:
 
     def publish(self, status: AutonomyStatus) -> None:
         self._publish(AUTONOMY_STATUS, status)
+
+    def judge(self, state: str, why: str = "") -> None:
+        """Say whether the motors obey."""
+        self._publish(STATUS, Status(value={"driveable": {"state": state, "why": why}}))
 
     def close(self) -> None:
         self._transport.close()
@@ -132,6 +136,10 @@ def test_the_list_ends_with_what_runs(run: Run, config: Path, manager: Manager) 
     manager.publish(AutonomyStatus(running=True, timestamp=2.0, file="follow", pid=4, overridden=True))
     assert run("script", "list", config) == 0
     assert run.out.splitlines()[-1] == "follow runs (process 4), but a person drives: it waits"
+    manager.judge("no", "serial: no board")
+    assert run("script", "list", config) == 0
+    assert run.out.splitlines()[-1] == "goob: Cannot be driven: serial: no board"
+    manager.judge("yes")
 
 
 @pytest.mark.parametrize(

@@ -99,7 +99,7 @@ def heard(sounds: Iterable[Arrival], window: Window) -> Heard:
 
     def percent(within_ms: float) -> float:
         arrived_s = sum(window.overlap_s(packet) for packet in packets if packet.ms <= within_ms)
-        return min(100.0, 100 * arrived_s / window.seconds)
+        return min(100.0, 100 * arrived_s / window.seconds)  # packets whose stamps overlap would give more
 
     return Heard([packet.ms for packet in packets], percent(math.inf), percent(ON_TIME_MS))
 

@@ -117,14 +117,14 @@ class ImpairedRobot:
     robot: Robot
     remote: Program  # its broker
     operator: Worker
-    limit_s: float  # for its operator's next report; the limits of that are shorter
+    limit_s: float  # for the operator's next report; the operator's own limits are shorter
 
     def report(self) -> Report:
         """Return the operator's next report. Raises PebbleError for a problem, a timeout, or an ended process."""
         try:
             report = msgspec.convert(self.operator.answer(self.limit_s), Report)
         except PebbleError as error:
-            report = Report(problem=str(error))
+            report = Report(problem=str(error))  # raised below, unless an ended program explains it
         if ended := next((program for program in (self.remote, *self.robot.programs) if program.ended), None):
             raise PebbleError(f"{self.subject}: {ended.name} has ended\n{ended.tail()}".rstrip())
         if report.problem is not None:

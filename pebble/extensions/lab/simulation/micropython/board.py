@@ -134,6 +134,7 @@ class Board:
         self.watchdog.check()
 
     def _modules(self) -> dict[str, Any]:
+        """Return MicroPython's own modules by name, as far as a board of this type has them."""
         modules = {
             **_SHARED,
             "gc": system.GC,

@@ -21,7 +21,7 @@ class Console:
         self.interrupt = 3
         self.reading = True
         self.lost = 0  # bytes
-        self._pause, self._wait = pause, wait
+        self._pause, self._wait = pause, wait  # the board's: for some seconds, and until there is input
         self.typed = bytearray()
         self._output = bytearray()
         self.is_interrupted = False
@@ -58,6 +58,7 @@ class Console:
             raise KeyboardInterrupt
 
     def take(self, count: int) -> bytearray:
+        """Return the next ``count`` bytes of input, once they have come. Raises KeyboardInterrupt at Ctrl-C."""
         self.check_interrupt()
         typed = self.typed
         while len(typed) < count:

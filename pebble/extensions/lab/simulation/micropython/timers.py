@@ -78,6 +78,7 @@ class SoftTimers:
         self.on_wait()
 
     def _call(self) -> None:
+        """Call the functions of the timers that are due; meanwhile none is :attr:`running`."""
         self._busy = True
         try:
             now = self._clock.now()

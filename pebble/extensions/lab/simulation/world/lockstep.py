@@ -89,7 +89,7 @@ class LockstepRobot:
         self.name = name
         self.motion = motion_of(world, name, floor)
         self.mcu = SimulatedMcu(world.robots[name].kind, 0.0, motion=self.motion)
-        self.tracks: dict[str, Track] = {}
+        self.tracks: dict[str, Track] = {}  # of all robots, by name; the world sets it
         self._world, self._camera = world, camera
         self._renderer: Renderer | None = None  # made for the first picture: not every test has OpenCV to load
         self._now = 0.0

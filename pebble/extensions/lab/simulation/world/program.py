@@ -83,7 +83,7 @@ def _page(path: Path, world: World) -> PosePage:
 
 
 def _publish_poses(page: PosePage, mcus: Mcus, end: EndSignal) -> None:
-    """Write the robots' poses to the page until the end is requested."""
+    """Write the robots' poses to the file that their cameras read, until the end is requested."""
     due = time.monotonic()
     while not end.wait(max(0.0, due - time.monotonic())):
         due = max(due + PERIOD_S, time.monotonic())

@@ -224,18 +224,22 @@ def _back_to_front(plan: _Floats, layers: Sequence[int], columns: _Floats) -> li
 
 
 def _covers(plan: _Floats, layers: NDArray[np.int_], columns: _Floats) -> NDArray[np.bool_]:
-    """Return a matrix that is true at ``[i, j]`` if surface i hides a part of j. The camera is at 0, 0."""
+    """Return a matrix that is true at ``[i, j]`` if surface i hides a part of j. The camera is at 0, 0.
+
+    ``plan``: edges, as in Renderer. ``columns``: the picture's columns of both edges of each surface. Of surfaces in
+    one plane that of the higher layer hides the other.
+    """
     start, along = plan[:, 0], plan[:, 1] - plan[:, 0]
     normal = np.stack((along[:, 1], -along[:, 0]), axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
     normal *= np.where((start * normal).sum(axis=1, keepdims=True) > 0, -1.0, 1.0)  # towards the camera
     # how far each edge of i is in front of the plane of j, negative behind it: [i, edge, j]
     before = np.einsum("iek,jk->iej", plan, normal) - (start * normal).sum(axis=1)
     most, least = before.max(axis=1), before.min(axis=1)  # of the two edges
-    in_front = (least > -_TOUCHING_M) & (most > _TOUCHING_M)
-    behind = (most < _TOUCHING_M) & (least < -_TOUCHING_M)
+    in_front = (least > -_TOUCHING_M) & (most > _TOUCHING_M)  # of i both edges, one of which may touch the plane of j
+    behind = (most < _TOUCHING_M) & (least < -_TOUCHING_M)  # the same on the other side
     one_plane = (np.abs(before) <= _TOUCHING_M).all(axis=1)
     may_cover = in_front | behind.T  # i is in front of the plane of j, or j is behind the plane of i
-    # If each may cover the other, neither does. Within one plane the layers decide.
+    # If each may cover the other, neither does.
     covers = (may_cover & ~may_cover.T) | (one_plane & one_plane.T & (layers[:, None] > layers))
     overlap = (columns[:, None, 0] < columns[:, 1]) & (columns[:, 0] < columns[:, None, 1])
     return np.asarray(covers & overlap & ~np.eye(len(plan), dtype=bool))
@@ -252,6 +256,7 @@ def _floor(world: World) -> tuple[Image, _Floats]:
     width = max(room.x_max - room.x_min, room.y_max - room.y_min)
     tiles = max(2, min(64, round(width / _TILE_M)))
     checkers = np.indices((tiles, tiles)).sum(axis=0) % 2
+    # Two shades of grey in turn, and each tile a little lighter by chance.
     shades = 120 + 26 * checkers + 20 * noise(7, tiles * tiles).reshape(tiles, tiles)
     picture = cv2.resize(shades.astype(np.uint8), (_FLOOR_PX, _FLOOR_PX), interpolation=cv2.INTER_NEAREST)
     scale = width / _FLOOR_PX

@@ -74,7 +74,7 @@ class SimulatedRobot(Robot):
         self._messages: dict[Channel, tuple[Any, float]] = {}  # by channel: the newest value, and when it came
         self._handlers: list[tuple[Channel, Handler]] = []
         self._picture: tuple[Image, float] | None = None  # the newest one, and the time that it shows
-        self._calls = 0  # since time has passed
+        self._calls = 0  # of the script since time last passed; too many end it
         self._latched = False
 
     # -- for tests

@@ -46,8 +46,9 @@ class Surfaces:
         self._world = world
         self._modules_across = _modules(world) + 2  # of a tag with its white border
         self._textures: dict[int, tuple[Image, ...]] = {}
+        room_walls = world.room.walls if world.room else ()
         self._fixed = [
-            *(_left_side(wall, index) for index, wall in enumerate(world.room.walls if world.room else ())),
+            *(_left_side(wall, index) for index, wall in enumerate(room_walls)),  # which faces into the room
             *chain(*(_both_sides(wall, index) for index, wall in enumerate(world.walls))),
             *map(_drawn, world.drawings),
             *(self._tag(tag.id, tag.size_m, tag.x, tag.y, tag.z, math.radians(tag.yaw_deg)) for tag in world.tags),
@@ -104,7 +105,7 @@ def _bgr(colour: str) -> Colour:
 
 
 def _drawn(drawing: Drawing) -> Surface:
-    """Return the surface of a drawing. Its masks hide what is between the shapes."""
+    """Return the surface of a drawing, whose masks make all but the shapes transparent."""
     import cv2
 
     # masked parts have a colour, too: in smaller textures it mixes into the edges of the shapes

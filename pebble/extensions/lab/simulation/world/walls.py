@@ -32,9 +32,9 @@ class Floor:
     def move(self, name: str, start: Pose, end: Pose) -> Pose:
         """Move a robot as far as the way is free; return its pose then, with the heading of ``end``."""
         with self._lock:
-            before = self._clearance_mm(name, start.x_mm, start.y_mm)
-            is_free = self._free(name, start, end, 1.0, before)
-            part = 1.0 if is_free else self._free_part(name, start, end, before)
+            start_clearance_mm = self._clearance_mm(name, start.x_mm, start.y_mm)
+            is_free = self._free(name, start, end, 1.0, start_clearance_mm)  # 1.0: the whole move
+            part = 1.0 if is_free else self._free_part(name, start, end, start_clearance_mm)
             x_mm, y_mm = _between(start, end, part)
             self._poses[name] = Pose(x_mm, y_mm, end.heading_rad)
             return self._poses[name]
@@ -43,21 +43,21 @@ class Floor:
         with self._lock:
             self._poses[name] = pose
 
-    def _free_part(self, name: str, start: Pose, end: Pose, before: float) -> float:
-        """Return how much of the move is free, 0 to 1, by halving. ``before``: the clearance at its start."""
+    def _free_part(self, name: str, start: Pose, end: Pose, start_clearance_mm: float) -> float:
+        """Return how much of the move is free, 0 to 1, by halving. ``start_clearance_mm``: at its start, see _free."""
         free, blocked = 0.0, 1.0
         for _ in range(_HALVINGS):
             middle = (free + blocked) / 2
-            if self._free(name, start, end, middle, before):
+            if self._free(name, start, end, middle, start_clearance_mm):
                 free = middle
             else:
                 blocked = middle
         return free
 
-    def _free(self, name: str, start: Pose, end: Pose, part: float, before: float) -> bool:
+    def _free(self, name: str, start: Pose, end: Pose, part: float, start_clearance_mm: float) -> bool:
         """True if the robot overlaps nothing after this part of the move, or not more than at its start."""
-        after = self._clearance_mm(name, *_between(start, end, part))
-        return after >= min(0.0, before) - _ROUNDING_MM
+        clearance_mm = self._clearance_mm(name, *_between(start, end, part))
+        return clearance_mm >= min(0.0, start_clearance_mm) - _ROUNDING_MM
 
     def _clearance_mm(self, name: str, x_mm: float, y_mm: float) -> float:
         """Return the distance from the robot's body to the nearest obstacle; negative if they overlap."""

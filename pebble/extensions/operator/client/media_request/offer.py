@@ -56,13 +56,13 @@ def refusal(ref: str, capabilities: dict[str, Any], medium: Medium) -> str:
     if section.get("controls") is not True:
         return words.fixed
     for channel in CHANNELS[medium]:
-        key = PLACES[channel][1]
+        _, key = PLACES[channel]
         if section.get(key) is not None and not names(ref, section[key], channel):
             return f"its capabilities name a topic for {words.name} that is not its own ({key})"
     return ""
 
 
 def best(medium: Medium, encodings: Collection[str], viewers: Sequence[frozenset[str]]) -> str | None:
-    """Return the encoding that the most viewers can show, the best of several; None if the robot lists none."""
+    """Return the encoding that the most viewers can show, at a tie the best one; None if the robot lists none."""
     readable = [encoding for encoding in BEST_FIRST[medium] if encoding in encodings]
     return max(readable, key=lambda encoding: sum(encoding in can for can in viewers), default=None)

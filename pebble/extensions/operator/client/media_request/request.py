@@ -47,7 +47,7 @@ class ViewerRequest:
         self._began_at = self._sent_at = self._received_at = self._keyframe_at = float("-inf")
 
     def check(self, encoding: str | None) -> None:
-        """Raise PebbleError if the robot does not offer the medium in ``encoding``, or (None) at all."""
+        """Raise PebbleError unless the robot offers the medium, and in ``encoding`` if that is not None."""
         if not (self.section.get("available") and self.section.get("controls")):
             raise PebbleError(f"{self._base} offers no {self._medium}")
         listed = self._encodings()
@@ -121,7 +121,7 @@ class ViewerRequest:
             return _JOIN_S
         if self._is_up is None:  # :meth:`tick` must know whether to raise the flag
             return _FLAG_S
-        may_be_of_others = self._shares and self._is_up and not self._requested
+        may_be_of_others = self._shares and self._is_up and not self._requested  # if so, a payload comes soon
         return _SLOW_S[self._medium] if may_be_of_others else 0.0
 
     def keyframe(self, encoding: str | None, now: float) -> list[Message]:

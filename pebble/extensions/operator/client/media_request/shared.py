@@ -27,7 +27,7 @@ _WAITS: Final[dict[Medium, str]] = {"video": "Pictures wait for driving", "audio
 class SharedRequest:
     """A request for a robot's pictures or sound, shared by all that show them here.
 
-    Used on the event loop only. Its coroutines are awaited only in a step of :meth:`run`.
+    Used on the event loop only. Await :meth:`follow` and :meth:`request_keyframe` only in the step of :meth:`run`.
     """
 
     def __init__(self, broker: Broker, ref: str, medium: Medium, receive: Callable[[bytes], None]) -> None:

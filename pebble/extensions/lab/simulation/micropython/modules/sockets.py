@@ -168,6 +168,7 @@ class HostTcp(BoardSocket, Stream):
         self._sock = context.wrap_socket(self._sock, server_hostname=server_hostname, do_handshake_on_connect=False)
 
     def _receive(self, size: int) -> bytes | None:
+        """Return up to ``size`` bytes, b"" at the connection's end, None if nothing has come or there is no Wi-Fi."""
         if not self._network.radio.connected:
             return None
         try:
@@ -177,8 +178,10 @@ class HostTcp(BoardSocket, Stream):
             chunk = None
         except OSError as error:
             self._network.problem = error.strerror or str(error)
-            raise (as_on_a_board(error) if isinstance(error, ssl.SSLError) else error) from None
-        self._network.unread = chunk is not None and len(chunk) == size
+            if isinstance(error, ssl.SSLError):
+                raise as_on_a_board(error) from None
+            raise error from None
+        self._network.unread = chunk is not None and len(chunk) == size  # there may be more: see HostNetwork
         return chunk
 
     def _send(self, data: bytes) -> int | None:

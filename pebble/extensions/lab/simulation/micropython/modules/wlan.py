@@ -47,7 +47,7 @@ class Radio:
             self.disconnect()
 
     def connect(self) -> None:
-        """Start to join. Raises OSError if inactive and, on an ESP32, while an attempt is in progress."""
+        """Start to join. Raises OSError if inactive; on an ESP32 also while an attempt is in progress."""
         if not self._active or (self.platform == "esp32" and self._wanted and not self.connected):
             raise OSError("Wifi Internal Error" if self._active else "Wifi Not Started")
         self._wanted, self._joined_at = True, float("inf")
