@@ -138,6 +138,7 @@ class Extension(Struct, frozen=True, kw_only=True, eq=False):
     rules: str = ""  # pairs of a Section and check(reader, section, path), which returns the section
     program: Program | None = None  # runs while the section is enabled, or always where there is none
     programs: str = ""  # a function of the config: its other Programs
+    prepare: str = ""  # a function of the config, called before its programs start
     observer: str = ""  # of config and clock: pebble.forwarding.observer.Observer, which sees what the bridge passes
     step: str = ""  # a function of the config: pebble.forwarding.observer.Step, which may refuse it
     requests: tuple[str, ...] = ()  # pebble.services.mqtt_bridge.own_requests.Requests, which the bridge fulfils

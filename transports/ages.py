@@ -76,8 +76,8 @@ class SenderClocks(Generic[K]):
     def age_s(self, key: K, sent: float, waited_s: float, now: float, late_s: float) -> float:
         """Return the seconds that a message stamped ``sent`` has waited at ``now``; learn the sender's clock from it.
 
-        A message that has waited for more than ``late_s`` is late. ``waited_s``: the most that it can have waited, by
-        other evidence. If not late it counts for `_Clock.proved`; by a clock of under 2 s (_YOUNG_S) no age is less.
+        ``waited_s``: the most that it can have waited, by other evidence. If that is at most ``late_s``, the message
+        proves a difference of the clocks. Until a clock is known for 2 s (_YOUNG_S), the age is at least ``waited_s``.
         """
         with self._lock:
             clock = self._clocks.get(key)

@@ -210,7 +210,7 @@ class Forwarder:
         """Forward a message whose sender is checked: the name moves from the topic into the payload."""
         sender = names[message.topic]
         subject, by = sender.subject, sender.account  # by: a Signed, below, adds the person for whom the account acts
-        outcome = self.admit(source, subject, message, sender.topic, by != NO_ACCOUNT)
+        outcome = self.admit(source, subject, message, sender.topic, by != NO_ACCOUNT)  # notes foreign ones, too
         if subject is None:
             outcome = sender.foreign  # why the topic means nothing to this robot
         elif isinstance(outcome, Forward):

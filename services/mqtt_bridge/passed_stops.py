@@ -79,8 +79,7 @@ class Owner:
         )
         if was_stopped and not state.latched:
             self.freed_at = now
-        pending = self.pending
-        if pending is not None and (self.confirms(str(pending.stop.stop)) or pending.is_counted(state)):
+        if (pending := self.pending) and (self.confirms(str(pending.stop.stop)) or pending.is_counted(state)):
             self.pending = None
 
 

@@ -277,7 +277,16 @@ def test_every_key_that_names_a_host_reads_it_so(place: str, value: object) -> N
 
 @pytest.mark.parametrize(
     "url",
-    ["mqtt://rover:s3cr3t@b", "mqtt://rover:s3cr3t", "mqtt://bro\nker", "mqtt://u:s3cr3t@[::1", "tcp://u:s3cr3t@b"],
+    [
+        *(
+            "mqtt://rover:s3cr3t@b",
+            "mqtt://rover:s3cr3t",
+            "mqtt://bro\nker",
+            "mqtt://u:s3cr3t@[::1",
+            "tcp://u:s3cr3t@b",
+        ),
+        "mqtt://[fe80::1]",
+    ],
 )
 def test_so_does_the_command_line(url: str, tmp_path: Path) -> None:
     for read in (settings_of, lambda text: init(tmp_path, [text])):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pebble.errors import PebbleError
 from pebble.ownership import owner_of
-from pebble.runtime.whole_file import is_root, sync_folder
+from pebble.runtime.whole_file import is_root, sync_file, sync_folder
 
 
 def write_new(file: Path, content: bytes) -> None:
@@ -23,7 +23,7 @@ def write_new(file: Path, content: bytes) -> None:
                 raise PebbleError(f"{file}: {why}")
             output.write(content)
             output.flush()
-            os.fsync(descriptor)
+            sync_file(descriptor)
         sync_folder(file.parent)
     except BaseException as error:
         file.unlink(missing_ok=True)

@@ -24,9 +24,10 @@ def of_broker(fleet: Fleet, name: str, secret: str, *, board: bool) -> dict[str,
 
 
 def of_certificate(fleet: Fleet, name: str) -> dict[str, Any]:
-    """Return what a certificate's owner needs: a hub its whole file, a robot or neighbour a part of its config.
+    """Return the settings of an account that has a certificate; empty if its roles need none.
 
-    Empty for others. The certificate, its key and the authority's certificate are in the same folder.
+    A hub gets its whole file, a robot or a neighbour the part of its config that connects it to the hub. The files that
+    the settings name, of the account and of the authority, are expected in the same folder.
     """
     roles = fleet.accounts[name].roles
     at_hub = _at_hub(fleet, name, certificates.CA_CERT, name)  # its certificate's files have the account's name

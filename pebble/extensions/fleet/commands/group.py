@@ -166,7 +166,7 @@ def role_(
         after = replace(fleet, accounts={**fleet.accounts, name: changed})
         how = applying.apply(place, after)
     typer.echo(f"{name} is {', '.join(changed.roles)} now ({how})")
-    return _print_left(_copies(place, after))
+    return _print_left(_copies(place, after))  # 1 if somebody must copy the new rules to a broker or hub elsewhere
 
 
 def password(name: _Name, folder_: _Folder = None) -> int:

@@ -163,7 +163,7 @@ def _locked(path: Path, problem: str) -> Iterator[bool]:
             raise RecordingError(problem) from None
         except OSError as error:
             text = "%s cannot be locked (%s): see that nothing else records into its folder, which is not noticed"
-            log.warning(text, path, error.strerror)
+            log.error(text, path, error.strerror)
             is_locked = False
         yield is_locked
 

@@ -77,9 +77,10 @@ def test_a_stop_reaches_a_living_address_behind_dead_ones(robot_on: Make, broker
     assert (stop.returncode, robot.latched) == (0, True), out + err
 
 
-def test_a_stop_is_confirmed_by_every_owner(run: Run, robot_on: Make, url: str) -> None:
-    robot = robot_on("left", "right")
-    assert run("estop", robot.id, url, "--why", "dog") == 0
+@pytest.mark.parametrize("id_", ["", "b\u00e4r", "ba\u0308r"])  # of two letters that look like one
+def test_a_stop_is_confirmed_by_every_owner(run: Run, robot_on: Make, url: str, id_: str) -> None:
+    robot = robot_on("left", "right", id_=id_)
+    assert run("estop", "b\u00e4r" if id_ else robot.id, url, "--why", "dog") == 0
     assert robot.latched
     assert run.out.splitlines()[-1].startswith(f"{robot.id}: stopped and confirmed after 0.")
     latch = robot.motors.owners[0].latch
@@ -327,10 +328,11 @@ def terminal() -> Iterator[tuple[int, int]]:
         os.close(end)
 
 
-def test_a_reset_shows_who_stopped_the_robot_and_frees_it(run: Run, robot_on: Make, url: str) -> None:
-    robot = robot_on("left", "right")
+@pytest.mark.parametrize("id_", ["", "ba\u0308r"])
+def test_a_reset_shows_who_stopped_the_robot_and_frees_it(run: Run, robot_on: Make, url: str, id_: str) -> None:
+    robot = robot_on("left", "right", id_=id_)
     robot.stop(by="ann@desk", why="dog")
-    assert run("estop", "reset", robot.id, url) == 0
+    assert run("estop", "reset", "b\u00e4r" if id_ else robot.id, url) == 0
     lines = run.out.splitlines()
     assert lines[0].startswith(f"{robot.id}: stopped by ann@desk, ")
     assert all(line.endswith(f": dog ({owner})") for line, owner in zip(lines, ("left", "right"), strict=False))
