@@ -34,8 +34,9 @@ def robot_account(
     """Publish probe messages below ``base`` and check that the broker accepts them.
 
     No program takes a probe for anything else. ``reads``: a further filter that the broker must grant. A probe must
-    come back within ``answer_s`` with MQTT 3.1.1, which tells no refusal, or if ``reads`` is given. Above the level
-    ``open``, a probe in the name of another robot must not come back.
+    come back within ``answer_s`` with MQTT 3.1.1, which tells no refusal, or if ``reads`` is given; with MQTT 5 a probe
+    among the commands must, unless it is refused. Above the level ``open``, a probe in the name of another robot must
+    not come back.
     """
     try:
         with reached(settings, "") as trial:
@@ -72,7 +73,16 @@ def _rights(trial: BrokerTrial, peer: Peer, topic: str, reads: str, *, must_come
         why = refusal or "it does not come back (or may this account not read it?)"
         fix = f"allow it to write and read {topic.rpartition('/')[0]}/# on the broker"
         return failed(f"this account may not publish to {topic}: {why}", fix)
+    if not must_come_back and (why := _why_deaf(trial, peer, topic.replace("/outgoing/", "/incoming/"))):
+        return failed(why, "allow it to read what it subscribes to on the broker")
     return ok("accepts what this account publishes")
+
+
+def _why_deaf(trial: BrokerTrial, peer: Peer, topic: str) -> str:
+    """Publish a probe among a robot's commands; return why it is not delivered, empty if it is or is refused."""
+    peer.subscribe(topic)
+    is_back, refusal = _echo(trial, peer, topic)
+    return "" if is_back or refusal else f"this account may not read {topic}: commands and stops do not reach the robot"
 
 
 def _why_not_granted(peer: Peer, filter_: str) -> str:
