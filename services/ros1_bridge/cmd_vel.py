@@ -140,6 +140,7 @@ class CmdVel:
             self._body, self._until, self._zeros = ZERO, 0.0, ZEROS
             self._out.send(ZERO)
             self._has_set_lock = True  # from the first lock on, new subscribers are told the state
+            self._unlocked_at = inf
             self._send_lock()
             if latched:
                 self._owe(True)  # does not wait for the disk: another thread writes the file
@@ -172,13 +173,14 @@ class CmdVel:
         return messages.boolean(self._latched)
 
     def _send_lock(self) -> None:
-        if self._lock is not None and self._lock.send(messages.boolean(self._latched)):
-            self._unlocked_at = inf if self._latched else time.monotonic()
+        if self._lock is not None and self._lock.send(messages.boolean(self._latched)) and not self._latched:
+            self._unlocked_at = time.monotonic()
 
     def settle(self) -> None:
         """Owe nothing more once a subscriber has had time to receive that the lock is open, and is still connected."""
         with self._changed:
-            if self._lock is not None and self._lock.names and time.monotonic() - self._unlocked_at > _SURE_S:
+            was_told = time.monotonic() - self._unlocked_at > _SURE_S
+            if self._lock is not None and self._lock.names and was_told and not self._latched:
                 self._owe(False)
 
     def _send(self) -> None:
