@@ -316,7 +316,7 @@ class Connection:
                     ack = PendingAck()  # of this packet
                     self.in_flight.ask(send(filters[at : at + FILTERS]), ack, asked[at : at + FILTERS])
             if not filters or self._client.socket is None:
-                ack.complete()
+                ack.set()
         self.wake()
         return ack
 

@@ -100,21 +100,8 @@ class Backlog:
         return message
 
 
-class PendingAck:
+class PendingAck(threading.Event):
     """A pending answer of the broker. The loss of the connection completes it, too."""
-
-    def __init__(self) -> None:
-        self._answered = threading.Event()
-
-    @property
-    def done(self) -> bool:
-        return self._answered.is_set()
-
-    def wait(self, timeout: float) -> bool:
-        return self._answered.wait(timeout)
-
-    def complete(self) -> None:
-        self._answered.set()
 
 
 class _Unconfirmed(Struct):
@@ -241,7 +228,7 @@ class InFlightTable:
         """Complete the answered requests. Call this after delivering the messages received before the answers."""
         answered, self.answered = self.answered, []
         for ack in answered:
-            ack.complete()
+            ack.set()
 
     def ping(self, now: float, ack: PendingAck | None) -> None:
         """Track a PINGREQ."""
@@ -285,10 +272,10 @@ class InFlightTable:
         self.lost_bytes = max((size for _, size in unanswered.values()), default=0)
         self.complete()
         for ack, _ in self._requests.values():
-            ack.complete()
+            ack.set()
         for ping in self._pings:
             if ping.ack is not None:
-                ping.ack.complete()
+                ping.ack.set()
         self._requests.clear()
         self._pings.clear()
 

@@ -359,7 +359,7 @@ class MqttTransport(Transport):
     ) -> None:
         """Run the connection until ``ack`` is done; ``receive`` gets the messages. Raises Lost, also when closing."""
         asked_at = clock.since_boot()
-        while not ack.done:
+        while not ack.is_set():
             if stopping.is_set():
                 raise Lost("closed")
             # The wait begins again while retained messages arrive, and on a thin link with every sign of life.
@@ -402,7 +402,7 @@ class MqttTransport(Transport):
             connection.publish(will)
         last = connection.ping()
         deadline = time.monotonic() + _CLOSING_S
-        while time.monotonic() < deadline and not (last.done and connection.drained):
+        while time.monotonic() < deadline and not (last.is_set() and connection.drained):
             connection.pump(deadline - time.monotonic(), ignore)
         connection.disconnect()
 
