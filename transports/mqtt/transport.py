@@ -71,11 +71,6 @@ class MqttTransport(Transport):
         self._logged = ("", 0.0)  # the newest problem in the log, and when it went there
 
     @property
-    def not_taken(self) -> Mapping[str, tuple[str, float]]:
-        """Topics that the broker does not accept: why, and when that was last logged."""
-        return self._refused.not_taken
-
-    @property
     def untried(self) -> bool:
         return self._dialler.addresses.untried
 
