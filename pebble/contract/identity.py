@@ -67,10 +67,6 @@ class Identity(Struct, frozen=True):
         """True for an operators' server or a gateway: it does not drive, and is not listed with robots."""
         return self.type in (SERVERS, GATEWAYS)
 
-    def incoming(self, metric: str) -> str:
-        """Return a topic that this component subscribes to; ``metric`` may have several levels."""
-        return f"{self.base}/{Direction.INCOMING}/{metric}"
-
     def outgoing(self, metric: str) -> str:
         """Return a topic that this component publishes; ``metric`` may have several levels."""
         return f"{self.base}/{Direction.OUTGOING}/{metric}"
