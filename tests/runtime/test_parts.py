@@ -337,16 +337,6 @@ def test_contents(seconds: str, repeats: bool) -> None:
     assert check.repeats is repeats
 
 
-@pytest.mark.parametrize(("hz", "asked", "found"), [(13, 15, None), (10, 15, 10), (19, 15, 19), (3, 0, None)])
-def test_rates(hz: int, asked: float, found: float | None) -> None:
-    check = SourceCheck(asked)
-    for number in range(2 * hz):
-        check.count(1, 100 + number / hz / 10)  # a start in a hurry
-    for number in range(13 * hz):
-        check.count(1, 102 + number / hz)
-    assert check.wrong_hz == (None if found is None else pytest.approx(found, rel=0.05))
-
-
 #: Values of three sensors, each letter for a second at 50 Hz: x changes, others stay; and who is found.
 SENSORS = {
     "at rest": (["aaaaaaaaaa", "bbbbbbbbbb", "cccccccccc"], ".........", ""),
