@@ -22,7 +22,7 @@ from tests.support import THOROUGH, cases, some
 
 def drain(backlog: Backlog) -> list[bytes]:
     taken = []
-    while backlog:
+    while backlog.waiting:
         taken.append(backlog.take().payload)
     return taken
 
@@ -55,7 +55,7 @@ def test_a_delivered_message_makes_what_waits_on_its_topic_stale() -> None:
     assert backlog.supersede(Message("a", b"4")) == 1
     assert backlog.supersede(Message("a", b"5", retain=True)) == 1
     assert drain(backlog) == [b"2"]
-    assert not backlog
+    assert not backlog.waiting
 
 
 def retained(topic: str, payload: bytes = b"1", qos: QoS = QoS.DELIVERED) -> Message:

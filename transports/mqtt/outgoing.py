@@ -51,16 +51,10 @@ class Backlog:
         self._live_bytes = 0  # of the messages that are not retained,
         self._live = 0  # and how many these are
 
-    def __bool__(self) -> bool:
-        return bool(self.waiting)
-
     @property
     def size(self) -> int:
         """Bytes of all payloads that wait."""
         return sum(len(message.payload) for message in self.waiting.values())
-
-    def __contains__(self, topic: str) -> bool:
-        return topic in self.waiting
 
     def put(self, message: Message) -> int:
         """Append ``message``; return how many messages were dropped to make room."""
