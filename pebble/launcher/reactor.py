@@ -86,7 +86,7 @@ class Reactor:
 
 
 class StopSignals:
-    """A counter of SIGTERM, SIGINT and SIGHUP from :meth:`install` on; ``descriptor`` is readable after each.
+    """A counter of SIGTERM, SIGINT and SIGHUP from :meth:`install` on; each sets ``wakeup``.
 
     From the second signal on, the handler calls ``on_repeat``, as the user no longer wants to wait. Main thread only.
     """
@@ -94,19 +94,11 @@ class StopSignals:
     def __init__(self, on_repeat: Callable[[], None]) -> None:
         self.received = 0
         self._on_repeat = on_repeat
-        self._wakeup = WakeupPipe()
-
-    @property
-    def descriptor(self) -> int:
-        return self._wakeup.fileno()
-
-    def drain(self) -> None:
-        """Make :attr:`descriptor` unreadable until the next signal."""
-        self._wakeup.clear()
+        self.wakeup = WakeupPipe()
 
     def install(self) -> None:
         """Handle the signals until the process ends, except ignored ones (nohup)."""
-        signal.set_wakeup_fd(self._wakeup.set_fileno, warn_on_full_buffer=False)
+        signal.set_wakeup_fd(self.wakeup.set_fileno, warn_on_full_buffer=False)
         for number in _SIGNALS:
             if signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, self._receive)
