@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator
 
 import msgspec
 
-from pebble.contract import DRIVE, ESTOP, codec
-from pebble.contract.identity import Direction, ParsedTopic, parse_topic
+from pebble.contract import DRIVE, ESTOP, INCOMING, codec
+from pebble.contract.identity import ParsedTopic, parse_topic
 from pebble.contract.names import BY, NAME, with_name
 from pebble.errors import PayloadError, TransportError
 from pebble.extensions.operator.client.announced import json_object
@@ -80,7 +80,7 @@ class NamedTopics:
 def _command(topic: str) -> ParsedTopic | None:
     """Return the parts of a command's topic, if it has no account yet."""
     parsed = parse_topic(topic)
-    if parsed is None or parsed.direction is not Direction.INCOMING or parsed.metric.startswith(f"{BY}/"):
+    if parsed is None or parsed.direction != INCOMING or parsed.metric.startswith(f"{BY}/"):
         return None
     return parsed
 
