@@ -62,7 +62,7 @@ class Link:
         """The other end does; all of it is in our socket when this returns."""
         if whole := b"".join(data):
             self.other.sendall(whole)
-            select.select([self.connection.socket], [], [], 5)
+            select.select([self.connection.client.socket], [], [], 5)
 
     def pump(self, *, until_read: int = 1) -> None:
         """Go on until so many messages are read."""
@@ -341,11 +341,11 @@ def test_how_long_an_answer_took_is_known(link: Link) -> None:
 
 
 def test_the_socket_keeps_little_while_the_way_is_slow(link: Link) -> None:
-    assert link.connection.socket is not None
+    assert link.connection.client.socket is not None
     sizes = []
     for slow in (False, True, False):
         link.connection.suit(thin=slow)
-        sizes.append(link.connection.socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT))
+        sizes.append(link.connection.client.socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT))
     assert sizes == [0, 4096, 0]
 
 
