@@ -62,7 +62,7 @@ class EventBuffer:
                 recent = [event for event in self._recent if 0 <= self._lost_at - event.sent_at <= RESEND_S]
                 waiting = recent + list(self._waiting)
                 self._counters.add("events_dropped", max(0, len(waiting) - LIMIT))
-                self._waiting = deque(waiting[-LIMIT :])
+                self._waiting = deque(waiting[-LIMIT:])
                 self._lost_at = None
             self._recent.clear()
             self._drain()
