@@ -138,6 +138,7 @@ class Extension(Struct, frozen=True, kw_only=True, eq=False):
     rules: str = ""  # pairs of a Section and check(reader, section, path), which returns the section
     program: Program | None = None  # runs while the section is enabled, or always where there is none
     programs: str = ""  # a function of the config: its other Programs
+    prepare: str = ""  # a function of the config, called before its programs start
     observer: str = ""  # of config and clock: pebble.forwarding.observer.Observer, which sees what the bridge passes
     step: str = ""  # a function of the config: pebble.forwarding.observer.Step, which may refuse it
     requests: tuple[str, ...] = ()  # pebble.services.mqtt_bridge.own_requests.Requests, which the bridge fulfils
@@ -435,15 +436,10 @@ def _of_file(path: Path) -> Extension:
     """
     if not path.is_file():
         raise PebbleError(f"there is no file {path}")
-    if hasattr(os, "getuid") and os.getuid() == 0:
-        uid = path.stat().st_uid
-        if not uid:
-            # Who may write in a folder may replace the file: in that of a link, and in that of the file behind it.
-            folders = (path.parent, path.resolve().parent)
-            uid = max(owner_of(folder, nameless=False).uid for folder in folders)
-        if uid:
-            why = "and root runs no code of other users: chown root it, in a folder of root's"
-            raise PebbleError(f"{path} belongs to user {uid}, {why}")
+    is_root = hasattr(os, "getuid") and os.getuid() == 0
+    if is_root and (uid := path.stat().st_uid or owner_of(path, nameless=False).uid):
+        why = "and root runs no code of other users: chown root it, in a folder of root's"
+        raise PebbleError(f"{path} belongs to user {uid}, {why}")
     name = path.stem
     if "." in name:
         raise PebbleError(f'a module has no "." in its name: rename the file {path.name}')

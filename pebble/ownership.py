@@ -50,7 +50,7 @@ def owner_of(folder: Path, *, nameless: bool = True, there: bool = False) -> Own
             return owner_of(place.parent.joinpath(target, *names), nameless=nameless, there=there)
         if owner.uid not in (0, uid):
             raise PebbleError(f"{place} belongs to user {uid}, and lies in a folder of user {owner.uid}: move it")
-        if uid == 0 and _is_shared(status):
+        if uid == 0 and _is_shared(place, status):
             raise PebbleError(f"{place} belongs to root, and others may write there: chmod go-w it, or chown it")
         owner = Owner(uid, status.st_gid)
     return owner
@@ -77,11 +77,19 @@ def _has_name(uid: int) -> bool:
     return False
 
 
-def _is_shared(folder: os.stat_result) -> bool:
-    """True if users other than the owner can replace files in the folder. In a sticky folder they cannot."""
-    writers = stat.S_IWOTH | (stat.S_IWGRP if folder.st_gid else 0)
-    is_sticky = bool(folder.st_mode & stat.S_ISVTX)
-    return bool(folder.st_mode & writers) and stat.S_ISDIR(folder.st_mode) and not is_sticky
+def _is_shared(place: Path, status: os.stat_result) -> bool:
+    """True if users other than the owner can replace files in this folder, or change this file."""
+    mode = status.st_mode
+    if not stat.S_ISREG(mode) and (not stat.S_ISDIR(mode) or mode & stat.S_ISVTX):  # there only owners remove files
+        return False
+    return bool(mode & stat.S_IWOTH or (mode & stat.S_IWGRP and (status.st_gid or _has_access_list(place))))
+
+
+def _has_access_list(place: Path) -> bool:
+    """True if an access control list names users; the bits of the group are then the most that they may do."""
+    with suppress(AttributeError, OSError):  # a system or a file system that has no lists
+        return "system.posix_acl_access" in os.listxattr(place)
+    return False
 
 
 def is_open(folder: Path) -> bool:

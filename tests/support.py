@@ -292,7 +292,7 @@ class AmqttBroker:
 def refused(number: int) -> Callable[..., Any]:
     """Return a function that raises this error, as a file system that refuses does."""
 
-    def refuse(*_arguments: Any) -> None:
+    def refuse(*_arguments: Any, **_options: Any) -> None:
         raise OSError(number, os.strerror(number))
 
     return refuse

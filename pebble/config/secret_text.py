@@ -7,6 +7,10 @@ _NAMES = "pass|secret|token|credential|(?:api|access|private|auth).?key"
 _KEY = re.compile(_NAMES, re.IGNORECASE).search
 _NAME = rf"[\w-]{{0,40}}(?:{_NAMES}|pwd)[\w-]{{0,40}}"
 _PAIR = re.compile(rf"(\b(?:{_NAME}|[\w-]{{0,40}}\bsig(?:nature)?)=)[^&\s]+", re.IGNORECASE)  # of a query or an option
+_HEADER = re.compile(
+    r"""(\b(?:authorization|cookie|x-[\w-]{0,40}(?:key|auth))\\?["']?\s*:\s*\\?["']?)[^\s\\"'][^\\"'\n]*""",
+    re.IGNORECASE,
+)
 _END = r"(?<!_file)(?<!_env)"  # of a name; what is in a file or a variable stays there
 #: A member of an object in JSON, in JSON that is itself a text there, and in Python's writing.
 _MEMBER = re.compile(
@@ -30,14 +34,15 @@ def is_secret(key: str) -> bool:
 
 
 def without_secrets(text: str) -> str:
-    """Return ``text`` with stars in place of logins in URLs, and of passwords and tokens in queries and options.
+    """Return ``text`` with stars in place of logins in URLs, and of secrets in queries, options and HTTP headers.
 
     It rather hides too much: in a word with ``://``, or a colon before an @, everything before the last @.
     """
     if _AT.search(text):
         text = re.sub(r"\S+", _without_login, _LOGIN_WITH_BLANKS.sub(rf"\1{HIDDEN}@", text))
     text = _PAIR.sub(rf"\1{HIDDEN}", text) if "=" in text else text
-    return _MEMBER.sub(rf"\1\2\3{HIDDEN}", text) if ":" in text else text  # of the three groups one is not empty
+    hidden = rf"\1\2\3{HIDDEN}"  # of the three groups one is not empty
+    return _MEMBER.sub(hidden, _HEADER.sub(rf"\1{HIDDEN}", text)) if ":" in text else text
 
 
 def _without_login(match: re.Match[str]) -> str:

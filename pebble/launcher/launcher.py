@@ -8,7 +8,7 @@ from typing import Any
 from pebble.config import Config
 from pebble.config.rules.doors import warning_of_open
 from pebble.errors import ConfigError, PebbleError
-from pebble.extension import Program, Stage, motors_of
+from pebble.extension import Program, Stage, motors_of, part
 from pebble.launcher.child import Child
 from pebble.launcher.driveable import Driveable
 from pebble.launcher.features import Features
@@ -76,6 +76,8 @@ class Launcher:
         lock_in_state_dir = config.state_file("launcher").with_suffix(".lock")
         with own_records, RunLock(config.run_dir(), config.base, lock_in_state_dir) as lock:
             self._signals.install()
+            for place in filter(None, (extension.prepare for extension in config.installed)):
+                part(place)(config)
             try:
                 self._reactor.every(_RUN_DIR_S, lambda: self._keep(lock))
                 self._start()

@@ -37,8 +37,8 @@ def set_mode(file: Path, mode: int, opened: Path | int | None = None) -> None:
     except OSError as error:
         if error.errno not in (errno.EPERM, *_NOT_HERE):
             raise
-        if os.stat(opened).st_mode & 0o077 & ~mode:  # noqa: PTH116
-            log.warning("%s: others can read it, which cannot be changed here: %s", file, error.strerror)
+    if os.name == "posix" and os.stat(opened).st_mode & 0o077 & ~mode:  # noqa: PTH116 - SMB may report no error
+        log.error("%s: others can read it, which cannot be changed here", file)
 
 
 def sync_file(descriptor: int, *, data: bool = False) -> None:

@@ -21,18 +21,13 @@ WITHDRAWN_S = 60.0  # so long an owner may have no emergency stop before its pen
 NAMES = 1024  # of stops: a minute of 17 in a second
 
 
-def is_stop(payload: bytes) -> bool:
-    """True for every payload but two: an empty one, which removes a retained message, and a probe for cycles."""
-    return bool(payload) and not codec.is_blank(payload)
-
-
 def is_named(payload: bytes) -> bool:
-    return is_stop(payload) and codec.decode(ESTOP, payload).stop is not UNSET
+    return bool(payload) and codec.decode(ESTOP, payload).stop is not UNSET
 
 
 def named(payload: bytes) -> bytes:
-    """Return a stop from the remote side with a name, and without an owner, which only the bridge may add."""
-    if not is_stop(payload):
+    """Return a stop with a name, and without an owner, which only the bridge may add."""
+    if not payload:  # no stop: it removes a retained message
         return payload
     stop = codec.decode(ESTOP, payload)
     if stop.stop is not UNSET and stop.owner is UNSET:
@@ -42,11 +37,18 @@ def named(payload: bytes) -> bytes:
 
 
 class Pending(Struct, frozen=True):
-    """A stop that an owner has not confirmed. ``first``: when it first came; ``at``: when the copy that waits came."""
+    """A stop that an owner has not confirmed. ``first``: when it first came; ``at``: when the copy that waits came.
+
+    ``before``: the owner's state then, if it receives the stop without its name: a greater count confirms it, too.
+    """
 
     stop: EstopCommand
     first: float
     at: float
+    before: EstopState | None
+
+    def is_counted(self, state: EstopState) -> bool:
+        return self.before is not None and self.before.boot == state.boot and state.count > self.before.count
 
 
 class Owner:
@@ -77,7 +79,7 @@ class Owner:
         )
         if was_stopped and not state.latched:
             self.freed_at = now
-        if self.pending is not None and self.confirms(str(self.pending.stop.stop)):
+        if (pending := self.pending) and (self.confirms(str(pending.stop.stop)) or pending.is_counted(state)):
             self.pending = None
 
 
@@ -95,12 +97,13 @@ class PassedStops:
         """Stops that are not confirmed, by owner."""
         return {key: owner.pending for key, owner in self._owners.items() if owner.pending is not None}
 
-    def accept(self, payload: bytes) -> list[bytes]:
+    def accept(self, payload: bytes, *, nameless: bool = False) -> list[bytes]:
         """Remember a named stop as forwarded, and expect owners to confirm it; return the payloads to publish.
 
         If owners were reset since it first came, and need not confirm it, only the others get it: a copy for each.
+        ``nameless``: the owners receive it from its sender, too, without this name.
         """
-        if not is_stop(payload):
+        if not payload:
             return [payload]
         stop = codec.decode(ESTOP, payload)
         now, name = self._clock(), str(stop.stop)
@@ -108,14 +111,14 @@ class PassedStops:
             first = self._passed.setdefault(name, now)
             if len(self._passed) > NAMES:
                 del self._passed[next(iter(self._passed))]
-            waiting = {key for key, owner in self._owners.items() if _waits(owner, name)}  # owners that may lack it
+            waiting = {key for key, pending in self.pending.items() if pending.stop.stop == name}  # these may lack it
             reset_since = {key for key, owner in self._owners.items() if owner.freed_at > first} - waiting
             if reset_since:  # this repeats a stop that a reset has ended there: only the other owners get a copy
-                return [_addressed(stop, key) for key in self._owners if key not in reset_since]
+                return [_encoded(stop, owner=key) for key in self._owners if key not in reset_since]
             for key, owner in self._owners.items():  # of each owner the newest stop stays pending
                 has_newer = owner.pending is not None and owner.pending.first > first
                 if key not in waiting and not has_newer and not owner.confirms(name):
-                    owner.pending = Pending(stop, first, now)
+                    owner.pending = Pending(stop, first, now, owner.state if nameless else None)
         return [payload]
 
     def follow(self, owner: str, state: EstopState | None) -> None:
@@ -127,7 +130,7 @@ class PassedStops:
         """Return the payloads to publish again, on the local side only; call this every ``REPEAT_S``."""
         with self._lock:
             waiting = self.pending.items()
-            return [_addressed(stop.stop, key) for key, stop in waiting if self._owners[key].withdrawn_at is None]
+            return [_encoded(stop.stop, owner=key) for key, stop in waiting if self._owners[key].withdrawn_at is None]
 
     def give_up(self) -> list[tuple[str, EstopCommand]]:
         """End the stops for owners whose state was withdrawn for too long; return them, each with its owner."""
@@ -139,14 +142,6 @@ class PassedStops:
                     self._owners[key].pending = None
                     ended.append((key, pending.stop))
         return ended
-
-
-def _waits(owner: Owner, name: str) -> bool:
-    return owner.pending is not None and owner.pending.stop.stop == name
-
-
-def _addressed(stop: EstopCommand, owner: str) -> bytes:
-    return _encoded(stop, owner=owner)
 
 
 def _encoded(command: EstopCommand, **fields: Any) -> bytes:

@@ -31,7 +31,7 @@ from pebble.services.mqtt_bridge.heartbeat import Heartbeat
 from pebble.services.mqtt_bridge.leftovers import Leftovers
 from pebble.services.mqtt_bridge.motor_owners import CHECK_S, MotorOwners
 from pebble.services.mqtt_bridge.own_requests import OwnRequests
-from pebble.services.mqtt_bridge.passed_stops import REPEAT_S, PassedStops, named
+from pebble.services.mqtt_bridge.passed_stops import REPEAT_S, PassedStops, is_named, named
 from pebble.services.mqtt_bridge.same_broker import SameBrokerProbe, now_ms
 from pebble.services.mqtt_bridge.uplink import POLL_S, uplink_of
 from pebble.services.mqtt_bridge.vouching import PERIOD_S, Vouching
@@ -348,6 +348,8 @@ class MqttBridge(ForwardingService):
             self._follow_owner(self._owners.topics[message.topic], message.payload)
         if message.topic == self._control_topic:
             self._follow_control(message.payload)
+        if message.topic == self._stop_topic and not message.retain:  # the owners have it unless one restarts now
+            self._passed_stops.accept(named(message.payload), nameless=not is_named(message.payload))
         self._leftovers.note_local(message)
         for admitted in self._private.admit(message):
             self._react(Side.LOCAL, admitted, self.forwarder.receive(Side.LOCAL, admitted))

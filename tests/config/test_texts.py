@@ -138,6 +138,9 @@ def test_a_secret_on_a_command_line_is_not_printed_again(run: Run) -> None:
         (f'{{"password" : "{SECRET}"}}', '{"password" : "***"}'),
         (f"{{'mqtt_password': '{SECRET}', 'port': 1}}", "{'mqtt_password': '***', 'port': 1}"),
         (f'"{{\\"api_key\\": \\"{SECRET}\\"}}"', '"{\\"api_key\\": \\"***\\"}"'),
+        (f'curl -H "Authorization: Bearer {SECRET}" x', 'curl -H "Authorization: ***" x'),
+        (f'"{{\\"Cookie\\": \\"{SECRET}; b\\"}}"', '"{\\"Cookie\\": \\"***\\"}"'),
+        (f"{{'X-API-Key': '{SECRET}', 'cookie': ''}}", "{'X-API-Key': '***', 'cookie': ''}"),
         ('{"password_file": "x", "token": ""}', '{"password_file": "x", "token": ""}'),
     ],
 )
@@ -274,7 +277,16 @@ def test_every_key_that_names_a_host_reads_it_so(place: str, value: object) -> N
 
 @pytest.mark.parametrize(
     "url",
-    ["mqtt://rover:s3cr3t@b", "mqtt://rover:s3cr3t", "mqtt://bro\nker", "mqtt://u:s3cr3t@[::1", "tcp://u:s3cr3t@b"],
+    [
+        *(
+            "mqtt://rover:s3cr3t@b",
+            "mqtt://rover:s3cr3t",
+            "mqtt://bro\nker",
+            "mqtt://u:s3cr3t@[::1",
+            "tcp://u:s3cr3t@b",
+        ),
+        "mqtt://[fe80::1]",
+    ],
 )
 def test_so_does_the_command_line(url: str, tmp_path: Path) -> None:
     for read in (settings_of, lambda text: init(tmp_path, [text])):

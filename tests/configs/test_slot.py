@@ -80,15 +80,22 @@ def test_back_and_forth(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (1, "pebble-slot: slot b is not whole, so a stays\n")
 
 
-@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/etc/hostname")])
-def test_a_release_has_plain_files_only(tmp_path: Path, make: Callable[[Path], object]) -> None:
+@pytest.mark.parametrize(
+    ("make", "why"),
+    [
+        (os.mkfifo, "has more than plain files"),
+        (lambda path: path.symlink_to("/etc/hostname"), "has more than plain files"),
+        (lambda path: (path.touch(), os.truncate(path, 1 << 40)), "it cannot be copied"),
+    ],
+)
+def test_a_release_has_small_plain_files_only(tmp_path: Path, make: Callable[[Path], object], why: str) -> None:
     slots, release = Slots(tmp_path), tmp_path / "release"
     release.mkdir()
     for name in ("RELEASE.json", "pebble_robot-1-py3-none-any.whl"):
         (release / name).touch()
     make(release / "robot.txt")
     done = slots.run("take", str(release))
-    assert (done.returncode, "has more than plain files" in done.stderr) == (1, True), done.stderr
+    assert (done.returncode, why in done.stderr) == (1, True), done.stderr
     assert not (Places(tmp_path).slots / "release.new").exists()
 
 

@@ -328,12 +328,20 @@ def test_a_check_refuses(files: dict[str, str], extensions: dict[str, Any], text
 
 
 @needs_root
-@pytest.mark.parametrize("name", ["lamp.py", "."])
-def test_root_runs_no_code_of_other_users(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "user", "mode", "text"),
+    [
+        ("lamp.py", 65534, 0o644, "root runs no code of other users"),
+        (".", 65534, 0o755, "lies in a folder of user 65534"),
+        ("lamp.py", 0, 0o666, "others may write there: chmod go-w it"),
+    ],
+)
+def test_root_runs_no_code_of_other_users(name: str, user: int, mode: int, text: str, tmp_path: Path) -> None:
     lamp_file(tmp_path, "lamp")
-    os.chown(tmp_path / name, 65534, 65534)
+    os.chown(tmp_path / name, user, user)
+    (tmp_path / name).chmod(mode)
     done = pebble("check", str(write(tmp_path, {"lamp.py": {}})))
-    assert (done.returncode, "root runs no code of other users" in done.stderr) == (1, True)
+    assert (done.returncode, text in done.stderr) == (1, True)
 
 
 WITHOUT = """

@@ -4,11 +4,14 @@ import os
 from pathlib import Path
 
 from pebble.errors import PebbleError
-from pebble.runtime.whole_file import sync_folder
+from pebble.ownership import owner_of
+from pebble.runtime.whole_file import is_root, sync_file, sync_folder
 
 
 def write_new(file: Path, content: bytes) -> None:
-    """Write a new file that only its owner can read. Raises PebbleError."""
+    """Write a new file that only its owner can read. Raises PebbleError, as root also as :func:`owner_of`."""
+    if is_root():
+        owner_of(file)
     try:
         descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o600)
     except OSError as error:
@@ -20,7 +23,7 @@ def write_new(file: Path, content: bytes) -> None:
                 raise PebbleError(f"{file}: {why}")
             output.write(content)
             output.flush()
-            os.fsync(descriptor)
+            sync_file(descriptor)
         sync_folder(file.parent)
     except BaseException as error:
         file.unlink(missing_ok=True)

@@ -48,7 +48,7 @@ class Database:
             upgrade(self._connection)
             self._own = None if path is None else OwnFile(path)
         except (OSError, sqlite3.Error) as error:
-            why = DatabaseError(path, error).why
+            why = DatabaseError(path, error).why.replace("is locked", "is locked, or its file system has no locks")
             raise PebbleError(f"{path}: cannot be used: {why}; name another file with --people FILE") from None
 
     @property

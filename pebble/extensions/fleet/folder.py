@@ -167,9 +167,15 @@ def locked(folder: Path) -> Iterator[None]:
         import fcntl  # Windows has none: there only what changes a fleet fails
 
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                log.error(
+                    "another command changes %s, and is waited for: `fuser -v %s` names it", folder, folder / _LOCK
+                )
+                fcntl.flock(descriptor, fcntl.LOCK_EX)
         except OSError as error:
-            log.warning("%s cannot be locked (%s): let no other command change it meanwhile", folder, error.strerror)
+            log.error("%s cannot be locked (%s): let no other command change it meanwhile", folder, error.strerror)
         yield
     finally:
         os.close(descriptor)

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from pebble.config.visible import shown
+from pebble.contract.identity import composed
 from pebble.extensions.recordings.files.reader import DAMAGE, RecordingFile, missing_before
 from pebble.extensions.recordings.files.recorded import ACTIVE, FOREVER_NS, Channel, Recorded, RecordingError
-from pebble.extensions.recordings.library import merged, robot_of, robots_of
+from pebble.extensions.recordings.library import is_of, merged, robot_of, robots_of
 from pebble.extensions.recordings.recorder.intake import EVENTS
 from pebble.transports.topics import matches
 
@@ -114,7 +115,7 @@ class Query:
     text: str | None = None  # somewhere in the payload
 
     def chooses(self, channel: Channel) -> bool:
-        if self.robot is not None and robot_of(channel.topic) != self.robot:
+        if self.robot is not None and not is_of(channel.topic, self.robot):
             return False
         return not self.topics or any(_matches(filter_, channel.topic) for filter_ in self.topics)
 
@@ -139,8 +140,10 @@ def check_names(query: Query, paths: Iterable[Path], places: Iterable[Path]) -> 
                     return
         except RecordingError:
             return
-    check_name("robot", query.robot, robots_of(channels), places)
-    topics = {channel.topic for channel in channels if query.robot in (None, robot_of(channel.topic))}
+    robots = robots_of(channels)
+    if query.robot not in [*map(composed, robots)]:
+        check_name("robot", query.robot, robots, places)
+    topics = {channel.topic for channel in channels if query.robot is None or is_of(channel.topic, query.robot)}
     for filter_ in query.topics:
         if not any(_matches(filter_, topic) for topic in topics):
             of_robots = {topic for topic in topics if not topic.startswith("$")}  # not those of recorder and broker

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 
-from pebble.contract.identity import parse_topic
+from pebble.contract.identity import composed, parse_topic
 from pebble.extensions.recordings.files.reader import Chooses, RecordingFile, in_time_order
 from pebble.extensions.recordings.files.recorded import ACTIVE as ACTIVE
 from pebble.extensions.recordings.files.recorded import FOREVER_NS as FOREVER_NS
@@ -103,6 +103,12 @@ def robot_of(topic: str) -> str | None:
     """Return ``system/type/id`` of a topic; None if it has none."""
     parsed = parse_topic(topic)
     return None if parsed is None else parsed.identity.base
+
+
+def is_of(topic: str, base: str | None) -> bool:
+    """True if a topic is of the robot that a user calls ``base``; its own name may spell accents otherwise."""
+    robot = robot_of(topic)
+    return robot is not None and composed(robot) == base
 
 
 def robots_of(channels: Iterable[Channel]) -> set[str]:

@@ -4,6 +4,7 @@ from pebble.extension import Extension
 
 EXTENSION = Extension(
     name="requests",
+    prepare="pebble.services.mqtt_bridge.requests.earlier_names:keep_stops",
     requests=(
         "pebble.services.mqtt_bridge.requests.actions:SystemActions",
         "pebble.services.mqtt_bridge.requests.media:MediaRequests",

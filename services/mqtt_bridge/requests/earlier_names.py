@@ -1,12 +1,13 @@
-"""Removes retained messages under the names that the robot had before its identity in the config was changed.
+"""Follows a change of the robot's identity in the config: stops last, and what the earlier name left is removed.
 
-Otherwise they would stay, and operators would see a robot that is off for ever.
+Otherwise retained messages would stay under it, and operators would see a robot that is off for ever.
 """
 
 import json
 import logging
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -32,53 +33,98 @@ CallIn: TypeAlias = Callable[[float, Callable[[], None]], Timer]  # calls later,
 WATCH_S = LEVELS["thin"].silent_s + 1.0  # in which another robot of that name would send a heartbeat
 _ARRIVE_S = 2.0  # for what a broker retains
 _OFFLINE = re.compile(rb'"online"\s*:\s*false')
+_FREE = b'"latched": false'  # in the file of a motor owner that no stop holds
 _NAMES = 16  # that are remembered
 _TOPICS = 1000  # that are removed of one name
 
 
+def keep_stops(config: Config) -> None:
+    """Remember the robot's name, and keep its stops if it or a motor owner had another name at the last start.
+
+    Raises PebbleError if a stop cannot be kept.
+    """
+    if config.path is None:
+        return
+    names = _names_of(config)
+    before = names[-1] if names else config.base
+    targets = [config.state_file(f"estop-{owner}") for owner in config.motor_owners]
+    for file in _stop_files(config, before):
+        for target in targets if file not in targets and _FREE not in _saved(file) else ():
+            if before != config.base or not target.exists():  # else the owner knows better
+                write(target, _saved(file), 0o600, PebbleError)
+                log.warning("stopped, as it was before names in the config were changed: %s", file)
+    if before != config.base or not names:
+        _remember(config, [*(name for name in names if name != config.base), config.base])
+
+
+def _stop_files(config: Config, base: str) -> list[Path]:
+    """Return the files that motor owners have saved under this name."""
+    end = f"-{file_name(base)}.json"
+    with suppress(OSError):  # no folder
+        files = [*_folder(config, file_name(base)).iterdir()]
+        return [file for file in files if file.name.startswith("estop-") and file.name.endswith(end)]
+    return []
+
+
+def _names_of(config: Config) -> list[str]:
+    """Return the base topics that the robot had with its config file, the newest last."""
+    try:
+        names = json.loads(_file(config).read_bytes())
+        return [Identity(*name.split("/")).base for name in names][-_NAMES:]
+    # No file at the first start, or one that is damaged.
+    except (OSError, ValueError, TypeError, AttributeError, RecursionError, ConfigError):
+        return []
+
+
+def _remember(config: Config, names: list[str]) -> None:
+    try:
+        make_folder(_file(config).parent)
+        write(_file(config), json.dumps(names).encode(), 0o600, PebbleError)
+    except (PebbleError, OSError) as error:
+        log.warning("its name cannot be remembered: %s", error)
+
+
+def _saved(file: Path) -> bytes:
+    """Return the state that a motor owner has saved; empty, which counts as a stop, if it cannot be read."""
+    try:
+        return file.read_bytes()
+    except FileNotFoundError:
+        return _FREE
+    except OSError:
+        return b""
+
+
+def _file(config: Config) -> Path:
+    """Return the file of names. Several robots may share a state directory, but not a config."""
+    return _folder(config, "") / f"names-{file_name(str(config.path and config.path.resolve()))}.json"
+
+
+def _folder(config: Config, name: str) -> Path:
+    """Return the state directory. By default each name has one of its own: then that of ``name``."""
+    folder = config.state_dir()
+    return folder.parent / name if folder.name == file_name(config.base) else folder
+
+
 class EarlierNames:
-    """The names that the robot had with this config file, as base topics; kept in a file."""
+    """A search for what is left of the names that the robot had with its config file."""
 
     def __init__(self, config: Config, sides: list[Transport], call_in: CallIn) -> None:
-        self._base, self._sides, self._call_in = config.base, sides, call_in
-        self._file: Path | None = None
-        if config.path is not None:  # several robots may share a state directory, but not a config
-            folder = config.state_dir()
-            if folder.name == file_name(config.base):  # by default each name has one of its own
-                folder = folder.parent
-            self._file = folder / f"names-{file_name(str(config.path.resolve()))}.json"
-        self._names: list[str] = []  # as in the file, the present one last
-        self._begun = False  # the search, which is made once
+        self._config, self._sides, self._call_in = config, sides, call_in
+        self._begun = config.path is None  # the search, which is made once
 
     def begin(self) -> None:
-        """Remember the robot's name, and look for messages of earlier ones. Call this when both sides are connected."""
-        if self._begun or self._file is None:
+        """Look for messages of earlier names. Call this when both sides are connected."""
+        if self._begun:
             return
         self._begun = True
-        try:
-            names = json.loads(self._file.read_bytes())
-            self._names = [Identity(*name.split("/")).base for name in names][-_NAMES:]
-        # No file at the first start, or one that is damaged.
-        except (OSError, ValueError, TypeError, AttributeError, RecursionError, ConfigError):
-            self._names = []
-        earlier = [name for name in self._names if name != self._base]
-        self._save([*earlier, self._base])
-        for name in earlier:
-            log.info("its name was %s before: what a broker retains under it is removed unless a robot has it", name)
-            _Removal(name, self._sides, self._call_in, partial(self._forget, name)).begin()
+        for name in _names_of(self._config):
+            if name != self._config.base:
+                text = "its name was %s before: what a broker retains under it is removed unless a robot has it"
+                log.info(text, name)
+                _Removal(name, self._sides, self._call_in, partial(self._forget, name)).begin()
 
     def _forget(self, name: str) -> None:
-        self._save([other for other in self._names if other != name])
-
-    def _save(self, names: list[str]) -> None:
-        if names == self._names or self._file is None:
-            return
-        self._names = names
-        try:
-            make_folder(self._file.parent)
-            write(self._file, json.dumps(names).encode(), 0o600, PebbleError)
-        except (PebbleError, OSError) as error:
-            log.warning("its name cannot be remembered: %s", error)
+        _remember(self._config, [other for other in _names_of(self._config) if other != name])
 
 
 class Renaming(Requests):

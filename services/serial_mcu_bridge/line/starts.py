@@ -23,7 +23,8 @@ class Starts:
     def sent(self, opened: int, mcu_ms: int, now: float) -> None:
         """Note the board's clock, which begins at 0 with each start. A clock that goes back shows a start."""
         back_ms = (self._clock_ms - mcu_ms) % (1 << _CLOCK_BITS)  # a clock that goes on is "back" by more than half
-        if opened == self._clock_opened and _LEAST_MS <= back_ms < 1 << (_CLOCK_BITS - 1):
+        is_back = min(_LEAST_MS, mcu_ms + 1) <= back_ms < 1 << (_CLOCK_BITS - 1)  # by much, or nearly to 0
+        if opened == self._clock_opened and is_back:
             self.began(now)
         self._clock_opened, self._clock_ms = opened, mcu_ms
 

@@ -145,5 +145,5 @@ class MotorBridge(MotorOwner, SerialService):
                 self.publish(c.CHARGING_LEVEL, ChargingLevel(value=volts))
             case DeviceLogLine(level, text):
                 self.device_log.log(logging.getLevelName(level), level, "MCU: %s", text)
-                if text.partition(" ")[0] == goob_base.STARTED:
+                if text.partition(" ")[0].endswith(goob_base.STARTED):  # noise may be before it
                     self.note_start()

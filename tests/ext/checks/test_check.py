@@ -193,6 +193,25 @@ def test_what_is_in_it_and_what_is_not(places: Places, tmp_path: Path, run: Run)
     assert "exists: name another file" in run.err
 
 
+@pytest.mark.parametrize(
+    ("section", "keys"),
+    [
+        ("mqtt_bridge", {"enabled": True, "reboot_control": {"command": "curl -u bob:hush-hush https://x"}}),
+        ("mqtt_bridge", {"enabled": True, "reboot_control": {"comand": ["curl", "-u", "bob:hush-hush"]}}),
+        ("of_another_program", {"bearer": "hush-hush", "pins": [["hush-hush"]]}),
+    ],
+)
+def test_a_text_that_the_config_does_not_have_is_not_in_it(
+    tmp_path: Path, run: Run, section: str, keys: dict[str, object]
+) -> None:
+    (tmp_path / "root").mkdir()
+    config = config_file(tmp_path, services={section: keys, "recorder": {"enabled": False, "directory": "kept"}})
+    assert run("doctor", config, "--report", tmp_path / "a.zip", "--root", tmp_path / "root") == 0
+    with zipfile.ZipFile(tmp_path / "a.zip") as packed:
+        text = "".join(packed.read(name).decode() for name in packed.namelist())
+    assert [part in text for part in (section, "hush-hush")] == [True, False]
+
+
 def test_each_secret_of_the_machine_is_known(places: Places) -> None:
     known = secrets_of(places, config_of(places)).known
     wanted = {

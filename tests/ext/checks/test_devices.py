@@ -255,20 +255,21 @@ def test_the_slot(active: str, current: str, whole: str, trial: bool, state: str
     judged(machine.slot(under_test(tmp_path)), state, text)
 
 
-#: Free blocks of 1 MB among 10,000, free files, flags.
+#: Blocks of 1 MB, those that are free, free files, flags.
 DISKS = [
-    (5000, 9, 0, "ok", "5.2 of 10.5 GB are free"),
-    (100, 9, 0, "failed", "0.1 of 10.5 GB are free"),
-    (5000, 0, 0, "failed", "no file can be made any more"),
-    (5000, 9, os.ST_RDONLY, "failed", "is read-only: no stop survives a power cut"),
+    (10_000, 5000, 9, 0, "ok", "5.2 of 10.5 GB are free"),
+    (10_000, 100, 9, 0, "failed", "0.1 of 10.5 GB are free"),
+    (10_000, 5000, 0, 0, "failed", "no file can be made any more"),
+    (10_000, 5000, 9, os.ST_RDONLY, "failed", "is read-only: no stop survives a power cut"),
+    (0, 0, 9, 0, "ok", "0.0 of 0.0 GB are free"),
 ]
 
 
-@pytest.mark.parametrize(("free", "files", "flags", "state", "text"), DISKS)
+@pytest.mark.parametrize(("size", "free", "files", "flags", "state", "text"), DISKS)
 def test_the_disk(
-    free: int, files: int, flags: int, state: str, text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    size: int, free: int, files: int, flags: int, state: str, text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found = os.statvfs_result((1 << 20, 1 << 20, 10_000, free, free, 100, files, files, flags, 255))
+    found = os.statvfs_result((1 << 20, 1 << 20, size, free, free, 100, files, files, flags, 255))
     monkeypatch.setattr(os, "statvfs", lambda _: found)
     judged(machine.disk(under_test(tmp_path)), state, text)
 

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shutil
+import struct
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,6 +18,7 @@ import pytest
 from pebble import ownership
 from pebble.config import load
 from pebble.errors import PebbleError
+from pebble.extensions.checks.new_file import write_new
 from pebble.extensions.checks.report.report import make
 from pebble.extensions.checks.report.secrets_here import secrets_of
 from pebble.extensions.fleet import applying
@@ -30,6 +32,8 @@ from pebble.extensions.operator.places import Places
 from pebble.extensions.page.commands.people import opened
 from pebble.extensions.recordings.commands.files import mend
 from pebble.extensions.recordings.files.writer import RecordingWriter
+from pebble.extensions.recordings.recorder.folder import Folder
+from pebble.extensions.recordings.recorder.metrics import STATUS
 from pebble.launcher.launcher import Launcher
 from pebble.ownership import owner_of
 from pebble.runtime.as_owner import as_before, as_owner, require_own
@@ -58,12 +62,16 @@ def page(folder: Path) -> None:
     People(folder / "file").close()
 
 
+def new(folder: Path) -> None:
+    write_new(folder / "file", b"written")
+
+
 def text(folder: Path) -> None:
     with as_owner(folder):
         (folder / "file").write_text("written")
 
 
-@pytest.mark.parametrize("write", [people, page, text])
+@pytest.mark.parametrize("write", [people, page, text, new])
 @pytest.mark.parametrize("there", [False, True])
 def test_a_link_leads_it_nowhere(write: Callable[[Path], None], there: bool, place: Path) -> None:
     roots, folder = place / "roots", place / "theirs"
@@ -129,9 +137,29 @@ def shared(theirs: Path) -> Path:
     return theirs.parent / "roots" / "new"
 
 
+def open_file(theirs: Path) -> Path:
+    (file := theirs.parent / "roots" / "robot.json").touch()
+    file.chmod(0o666)
+    return file
+
+
+def listed(theirs: Path) -> Path:
+    """A folder of root's whose access control list lets nobody write: as setfacl -m u:nobody:rwx makes it."""
+    entries = ((1, 7, -1), (2, 7, NOBODY), (4, 5, -1), (16, 7, -1), (32, 5, -1))  # user, one user, group, most, others
+    packed = b"".join(struct.pack("<HHi", *entry) for entry in entries)
+    os.setxattr(theirs.parent / "roots", "system.posix_acl_access", struct.pack("<I", 2) + packed)
+    return theirs.parent / "roots" / "new"
+
+
 @pytest.mark.parametrize(
     ("path_of", "why"),
-    [(linked, "is a link of user 65534"), (of_root, "lies in a folder of user 65534"), (shared, "others may write")],
+    [
+        (linked, "is a link of user 65534"),
+        (of_root, "lies in a folder of user 65534"),
+        (shared, "others may write"),
+        (open_file, "others may write"),
+        (listed, "others may write"),
+    ],
 )
 def test_where_others_could_put_a_folder_it_does_nothing(
     path_of: Callable[[Path], Path], why: str, place: Path
@@ -140,8 +168,11 @@ def test_where_others_could_put_a_folder_it_does_nothing(
     roots.mkdir(0o755)
     folder.mkdir()
     os.chown(folder, NOBODY, NOBODY)
-    with pytest.raises(PebbleError, match=why), as_owner(path_of(folder)):
+    path = path_of(folder)
+    with pytest.raises(PebbleError, match=why), as_owner(path):
         pass
+    with pytest.raises(PebbleError, match=why):
+        write_new(path, b"")
 
 
 def config(theirs: Path, **services: object) -> Path:
@@ -199,6 +230,11 @@ def world(theirs: Path, _: Path) -> object:
     return program.run(program.ROOM)
 
 
+def recordings(theirs: Path, secret: Path) -> object:
+    (theirs / f".{STATUS}.part").symlink_to(secret)
+    return Folder(theirs).take()
+
+
 def holes(theirs: Path, _: Path) -> object:
     (theirs / "fleet.json").touch()
     os.truncate(theirs / "fleet.json", 1 << 40)
@@ -220,7 +256,7 @@ def copy(theirs: Path, _: Path) -> object:
 
 
 @pytest.mark.parametrize(
-    "act", [password, answers, robot, script, report, container, everybody, world, holes, lines, copy]
+    "act", [password, answers, robot, script, report, container, everybody, world, recordings, holes, lines, copy]
 )
 def test_what_a_user_names_root_neither_reads_nor_runs(
     act: Callable[[Path, Path], object], place: Path, monkeypatch: pytest.MonkeyPatch

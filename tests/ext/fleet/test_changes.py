@@ -293,6 +293,19 @@ def test_commands_change_a_folder_one_after_the_other(tmp_path: Path) -> None:
     assert check.of_rules(broker.folder, broker.fleet) == []
 
 
+def test_a_command_that_waits_for_another_one_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    def change() -> None:
+        with locked(tmp_path):
+            pass
+
+    other = threading.Thread(target=change)
+    with locked(tmp_path):
+        other.start()
+        assert until(lambda: f"another command changes {tmp_path}, and is waited for" in caplog.text)
+        assert {record.levelname for record in caplog.records} == {"ERROR"}, "commands show only errors"
+    other.join()
+
+
 # -- certificates
 
 

@@ -88,6 +88,17 @@ def test_one_robot_is_deleted(folder: Path, run: Run) -> None:
     assert "fred" not in run.out
 
 
+def test_a_robot_is_found_by_a_name_that_looks_the_same(tmp_path: Path, run: Run) -> None:
+    recorder = Recorder(tmp_path / "rec", Options())
+    recorder.start()
+    recorder.receive("pebble/robots/ba\u0308r/outgoing/online", b'{"t":1}', 1, retain=False)
+    recorder.stop()
+    assert run("recordings", "search", tmp_path / "rec", "--robot", "b\u00e4r") == 0
+    assert "outgoing/online" in run.out
+    assert run("recordings", "rm", tmp_path / "rec", "--robot", "b\u00e4r", "--yes") == 0
+    assert run.out == "1 messages deleted\n"
+
+
 def test_what_a_recorder_uses_is_left_alone(folder: Path, run: Run) -> None:
     recorder = Recorder(folder, Options(free_bytes=0))
     recorder.start()
@@ -100,14 +111,16 @@ def test_what_a_recorder_uses_is_left_alone(folder: Path, run: Run) -> None:
     assert messages(folder) == 201
 
 
-def test_a_share_without_locks_is_recorded_to(
+def test_a_share_without_locks_sizes_and_times_is_recorded_to(
     folder: Path, run: Run, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     left = folder / "2026/11/20/20261120T232921Z-000999.state.mcap.active"
     left.parent.mkdir(parents=True, exist_ok=True)
     left.write_bytes(b"")
     monkeypatch.setattr("fcntl.flock", refused(errno.ENOLCK))
-    recorder = Recorder(folder, Options(free_bytes=0))
+    monkeypatch.setattr("os.utime", refused(errno.EPERM))
+    monkeypatch.setattr("os.statvfs", lambda _: os.statvfs_result((512, 512, 0, 0, 0, 0, 0, 0, 0, 255)))
+    recorder = Recorder(folder, Options())
     recorder.start()
     recorder.receive(f"{GOOB}/outgoing/online", b'{"t":1}', 1, retain=False)
     recorder.stop()
@@ -115,6 +128,7 @@ def test_a_share_without_locks_is_recorded_to(
     assert (messages(folder), left.exists()) == (202, True)  # what may be another recorder's stays
     assert run("recordings", "rm", left, "--yes") == 1
     assert run("recordings", "rm", folder, "--robot", "fred", "--yes") == 1
+    assert f"pebble: {folder}/recorder.lock cannot be locked" in run.err
     assert messages(folder) == 102
 
 

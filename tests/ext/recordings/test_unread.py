@@ -237,7 +237,10 @@ class TestInterrupted:
         [
             ((rewriting.os, "fsync", refused(errno.ENOSPC)), "No space left on device"),
             ((RecordingWriter, "finish", lambda _writer: None), "cannot be read again"),
-            ((rewriting.shutil, "disk_usage", lambda _folder: SimpleNamespace(free=1000)), "there is no room"),
+            (
+                (rewriting.shutil, "disk_usage", lambda _folder: SimpleNamespace(free=9, total=9)),
+                "there is no room",
+            ),
         ],
     )
     def test_a_copy_that_cannot_be_made(

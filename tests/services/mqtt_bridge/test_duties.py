@@ -18,7 +18,7 @@ from pebble.contract import CHANNELS, GIT_PULL, REBOOT, Kind
 from pebble.runtime.parent import Notifier
 from pebble.services.mqtt_bridge.motor_owners import MotorOwners
 from pebble.services.mqtt_bridge.requests.actions import ACTIONS, Action, Row
-from pebble.services.mqtt_bridge.requests.earlier_names import CallIn, EarlierNames
+from pebble.services.mqtt_bridge.requests.earlier_names import CallIn, EarlierNames, keep_stops
 from pebble.services.mqtt_bridge.vouching import Vouching
 from pebble.transports import Answer, Transport
 from pebble.transports.memory import MemoryHub, MemoryTransport
@@ -248,6 +248,7 @@ class Named:
         for side in sides:
             side.open(5 if connected else 0.5)
         jobs: list[Callable[[], None]] = [meanwhile]
+        keep_stops(load(self.config))
         names = EarlierNames(load(self.config), sides, lambda _seconds, job: jobs.append(job))  # type: ignore[arg-type]
         names.begin()
         while jobs:
@@ -292,6 +293,47 @@ def test_what_was_retained_under_an_earlier_name_is_removed(robot: Named) -> Non
     assert (robot.left, robot.known) == ([], ["rover", "rover-two"])
     robot.start("rover-two")
     assert robot.known == ["rover-two"]
+
+
+STOPPED, FREE = '{"latched": true, "recent": []}', '{"latched": false, "recent": []}'
+
+
+@pytest.mark.parametrize(
+    ("names", "before", "now", "kept"),
+    [
+        (("rover", "rover-two"), STOPPED, None, STOPPED),
+        (("rover", "rover-two"), "damaged", FREE, "damaged"),
+        (("rover", "rover-two"), FREE, STOPPED, STOPPED),
+        (("rover", "rover-two"), FREE, None, None),
+        (("serial", "left"), STOPPED, None, STOPPED),
+        (("serial", "left"), STOPPED, FREE, FREE),
+    ],
+)
+@pytest.mark.parametrize("by_name", [False, True])
+def test_a_stopped_robot_stays_stopped_under_another_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, by_name: bool,
+    names: tuple[str, str], before: str, now: str | None, kept: str | None,
+) -> None:  # fmt: skip
+    """``names``: of the robot, or of its motor owner. ``by_name``: each robot has a state directory of its own."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "home"))
+    path, files = tmp_path / "robot.json", list[Path]()
+    transport = {"kind": "zenoh"} | ({} if by_name else {"state_dir": str(tmp_path / "state")})
+    line = {"enabled": True, "serial": {"port": "/dev/null"}}
+    for name, content in zip(names, (before, now), strict=True):
+        bridge = {"instances": {"left": line}} if name == "left" else line
+        robot = {"id": name if name.startswith("rover") else "goob"}
+        services = {"serial_mcu_bridge": bridge}
+        path.write_text(json.dumps({"robot": robot, "transport": transport, "services": services}))
+        config = load(path)
+        files.append(config.state_file(f"estop-{config.motor_owners[0]}"))
+        files[-1].parent.mkdir(parents=True, exist_ok=True)
+        if content is not None:
+            files[-1].write_text(content)
+        keep_stops(config)
+    assert (files[1].read_text() if files[1].exists() else None) == kept
+    files[1].write_text(FREE)
+    keep_stops(load(path))
+    assert files[1].read_text() == FREE, "it was reset"
 
 
 def test_what_another_robot_retains_stays(robot: Named) -> None:

@@ -144,6 +144,7 @@ def test_a_stop_that_is_given_up_is_told_once() -> None:
         (b"{}", "", ""),
         (b'{"stop": "x", "by": "ann", "why": "dog"}', "ann", "dog"),
         (b"x" * 100_000, "", ""),
+        (b" \n", "", ""),  # echo | mosquitto_pub -s
     ],
 )
 def test_one_without_a_name_gets_one(raw: bytes, by: str, why: str) -> None:
@@ -152,7 +153,7 @@ def test_one_without_a_name_gets_one(raw: bytes, by: str, why: str) -> None:
     assert first.stop != second.stop
 
 
-@pytest.mark.parametrize("raw", [b"", b"   ", payload("a"), b'{"stop": "aaaaaaaaaaaaaaaa", "more": 1}'])
+@pytest.mark.parametrize("raw", [b"", payload("a"), b'{"stop": "aaaaaaaaaaaaaaaa", "more": 1}'])
 def test_what_has_a_name_or_is_no_stop_passes_as_it_is(raw: bytes) -> None:
     assert named(raw) == raw
     assert PassedStops(ONE, lambda: 0.0).accept(raw) == [raw]
@@ -183,6 +184,33 @@ def test_the_bridge_repeats_it_on_the_robots_side_only(monkeypatch: pytest.Monke
     world.run(3)
     assert len(world.local.on(STOP)) == before
     assert not world.remote.on(STOP)
+
+
+@pytest.mark.parametrize(("boot", "repeats"), [("00000001", False), ("00000002", True)])
+def test_without_a_name_an_owner_that_lives_gets_it_once(boot: str, repeats: bool) -> None:
+    stops = PassedStops(ONE, lambda: 0.0)
+    stops.follow("serial", FREE)
+    stops.accept(payload("a"), nameless=True)
+    assert stops.repeat()
+    stops.follow("serial", replace_state(FREE, boot=boot, latched=True, count=1, recent=[NAME["b"]]))
+    assert bool(stops.repeat()) is repeats
+
+
+@pytest.mark.parametrize("one", [True, False])
+def test_one_of_the_robots_own_side_is_repeated_too(one: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World("bridge", monkeypatch, one=one)
+    world.start(serial={"enabled": True, "serial": {"port": "/dev/serial"}})
+    world.run()
+    world.local.publish(STOP, b"{}")
+    world.run(1.9)
+    first, *repeated = [codec.decode(ESTOP, raw) for raw in world.local.payloads(STOP) if raw != b"{}"]
+    assert {(stop.stop, stop.owner) for stop in (first, *repeated)} == {(first.stop, "serial")}
+    state = replace_state(FREE, latched=True, count=1, recent=[first.stop])
+    world.local.publish(ESTOP_STATE.topic("", owner="serial")[1:], codec.encode(ESTOP_STATE, state), retain=True)
+    world.run(1)
+    before = len(world.local.on(STOP))
+    world.run(3)
+    assert len(world.local.on(STOP)) == before
 
 
 def test_what_a_withdrawn_owner_has_not_confirmed_is_told(

@@ -292,6 +292,7 @@ STARTS = {
     "its clock begins anew": ([(0, "open"), (1, 60_000), (5, 300), (9, 4_300), (12, 10)], 13, 2),
     "its clock wraps": ([(0, "open"), (1, 2**32 - 5), (2, 1_000)], 3, 0),
     "samples overtake one another": ([(0, "open"), (1, 60_000), (2, 59_500)], 3, 0),
+    "it never runs for a second": ([(0, "open"), (1, 800), (1.1, 0), (3.9, 700), (4, 10), (7, 900), (7.1, 30)], 8, 3),
     "its clock is that of another opening": ([(0, "open"), (1, 60_000), (5, "open"), (5.1, 10)], 6, 1),
     "long ago": ([(0, "open"), (5, "start"), (30, "start")], 66, 1),
 }

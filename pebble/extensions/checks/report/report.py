@@ -9,7 +9,7 @@ import platform
 import sys
 import time
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -20,7 +20,7 @@ from pebble.config.config import resolved
 from pebble.config.masking import masked
 from pebble.config.problems import Notes
 from pebble.config.raw import decode, plain, read_text
-from pebble.config.secret_text import without_secrets
+from pebble.config.secret_text import HIDDEN, without_secrets
 from pebble.contract import OUTGOING
 from pebble.errors import PebbleError
 from pebble.extensions.checks.machine import output_of
@@ -108,14 +108,33 @@ def _index(report: Report, known: Secrets) -> str:
 
 
 def _config(here: Here) -> str:
-    """Return the config file and the config with its defaults, with secrets masked."""
+    """Return the config file and the config with its defaults, with secrets masked.
+
+    Of the file's texts only those are shown that the config has: any other may be a secret at an unknown key.
+    """
     written = masked(plain(decode(read_text(here.file), here.file.name), Notes()))
-    config: dict[str, Any] = {"file": str(here.file), "written": written}
-    if here.config is None:
-        config["problems"] = here.problem.splitlines()
-    else:
-        config["resolved"] = resolved(here.config)
+    complete = {} if here.config is None else {"resolved": resolved(here.config)}
+    problems = {"problems": here.problem.splitlines()} if here.config is None else {}
+    config = {"file": str(here.file), "written": _shown(written, {*_texts(complete)}), **problems, **complete}
     return json.dumps(config, indent=1, ensure_ascii=False)
+
+
+def _texts(value: Any) -> Iterator[str]:
+    """Yield all texts in plain data, but no keys."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict | list):
+        for item in value.values() if isinstance(value, dict) else value:
+            yield from _texts(item)
+
+
+def _shown(value: Any, known: Collection[str]) -> Any:
+    """Return plain data with stars in place of texts that are not ``known``."""
+    if isinstance(value, dict):
+        return {key: _shown(item, known) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_shown(item, known) for item in value]
+    return HIDDEN if isinstance(value, str) and value not in known else value
 
 
 def _doctor(here: Here) -> str:

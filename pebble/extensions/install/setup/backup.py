@@ -42,6 +42,7 @@ _NEVER_SAVED = ("-wal", "-shm", ".mcap", ".new", ".pid", ".pyc", "/mosquitto.db"
 _SHA256 = "PEBBLE.sha256"  # of the content, in the header of each file but the first
 _LARGEST = 64 << 20  # bytes of one file
 _MOST = 1 << 30  # bytes of a backup
+_LONGEST_NAME = 255  # bytes, of all file systems
 _END = 2 * tarfile.BLOCKSIZE  # bytes of zeros, at least
 #: Keys of mosquitto's configuration that name a file of accounts, rules or keys.
 _BROKER_FILES = re.compile(
@@ -250,6 +251,7 @@ def _path(member: tarfile.TarInfo, backup: Backup, name: str) -> str:
         or ".." in path.parts
         or str(path) != member.name
         or "\0" in member.name
+        or any(len(os.fsencode(part)) > _LONGEST_NAME for part in path.parts)
     ):
         raise BackupError(f"{name}: {member.name!r} is not what a backup has: it was changed, or is of another program")
     if member.name in backup.files:

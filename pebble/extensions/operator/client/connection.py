@@ -57,12 +57,15 @@ def target_of(robot: str | None, options: Target) -> Target:
 
 
 @contextmanager
-def connected(target: Target) -> Iterator[tuple[Transport, Names]]:
-    """Connect, and disconnect at the end. Raises PebbleError with a remedy if the connection fails."""
+def connected(target: Target, *, needed: bool = True) -> Iterator[tuple[Transport, Names]]:
+    """Connect, and disconnect at the end. Raises PebbleError with a remedy if the connection fails.
+
+    ``needed`` False: a connection that cannot be made yet is tried again and again in the ``with`` block.
+    """
     kind, settings, names, where = resolve(target)
     transport = create(kind, f"pebble-tool-{os.getpid()}", in_small_segments(settings))
     with closing(transport.open(OPEN_TIMEOUT_S)):
-        if transport.state is not State.CONNECTED:
+        if needed and transport.state is not State.CONNECTED:
             why = transport.problem or f"no answer within {OPEN_TIMEOUT_S:g} s"
             raise TransportError(f"cannot connect to {where}: {why}")
         not_received = _report_missing(transport)  # in words

@@ -2,6 +2,7 @@
 
 import difflib
 from collections.abc import Iterator
+from unicodedata import normalize
 
 from pebble.contract import CHANNELS, INCOMING, OUTGOING, Channel, channel_of
 from pebble.contract.identity import Identity, composed, parse_topic
@@ -86,6 +87,11 @@ def base_of(robot: str) -> str:
     if len(levels) != 3:
         raise NamingError(f'--robot {robot}: give its id, or "system/type/id"')
     return Identity(*map(composed, levels)).base
+
+
+def spellings(base: str) -> list[str]:
+    """Return a base topic with its accents spelled in both ways: robots of other programs may have the rare one."""
+    return [*dict.fromkeys((base, normalize("NFD", base)))]
 
 
 def id_of(base: str) -> str:

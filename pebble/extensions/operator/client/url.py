@@ -4,7 +4,7 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-from pebble.config.hosts import HostError, split
+from pebble.config.hosts import HostError, broker_host, split
 from pebble.config.text_files import read_password
 from pebble.errors import PebbleError
 from pebble.runtime.connections import ALL_VITAL
@@ -57,6 +57,7 @@ def _mqtt(url: str, password: str | None, ca_cert: Path | None) -> MqttSettings:
         raise UrlError(f"--url names one broker: a name that has the addresses of all, or that of a cluster: {FORMS}")
     try:
         parts = split(url)
+        host = broker_host(parts.host)
     except HostError as error:
         raise UrlError(f"--url {error}; use {FORMS}") from None
     if parts.password is not None:
@@ -71,7 +72,7 @@ def _mqtt(url: str, password: str | None, ca_cert: Path | None) -> MqttSettings:
     if ca_cert is not None and not encrypted:
         raise UrlError("--ca-cert has no use with mqtt://: use mqtts://")
     return MqttSettings(
-        host=parts.host,
+        host=host,
         port=port,
         username=parts.user,
         vital=ALL_VITAL,  # small commands are sent even if the broker hangs up after them, see RefusedTopics

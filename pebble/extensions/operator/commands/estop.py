@@ -35,7 +35,7 @@ from pebble.extensions.operator.client.driveable import Driveable, doubt_of, is_
 from pebble.extensions.operator.client.estop import Progress, RobotStop, StopSender, new_name, send
 from pebble.extensions.operator.client.estop_states import Reset, RobotEstop
 from pebble.extensions.operator.client.heartbeats import Heartbeats
-from pebble.extensions.operator.client.names import id_of
+from pebble.extensions.operator.client.names import id_of, spellings
 from pebble.extensions.operator.client.robot_topics import SYNONYMS
 from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.extensions.operator.commands import show
@@ -130,9 +130,13 @@ def me(account: str | None = None) -> str:
 
 
 def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
-    """Send stops, and listen on a second connection, so that what arrives delays none of them."""
-    with interrupted_by_signals(), connected(target) as (transport, names):
-        robots = None if every else [names.base]
+    """Send stops, and listen on a second connection, so that what arrives delays none of them.
+
+    A stop of one robot waits for a connection, as a broker may be restarting. Robots of a broker that is not there
+    cannot be found.
+    """
+    with interrupted_by_signals(), connected(target, needed=every) as (transport, names):
+        robots = None if every else spellings(names.base)
         sender = StopSender(new_name(), by=me(names.account), why=why, now=time.monotonic(), robots=robots, hold=hold)
         put_account_into_topics(
             transport, names, lambda base: base in sender.robots and sender.robots[base].estop.named
@@ -142,12 +146,13 @@ def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
         report = _Report(sender, outbox)
         try:
             with _heartbeats(target, every=every) as heartbeats, listening(target, transport) as second:
-                listener, subscribing = _listen(second, names.base)
+                listener, subscribing = _listen(second, robots or [names.base])
                 while not sender.finished:
                     for message in heartbeats.take() if heartbeats else ():
                         sender.receive(message, time.monotonic())
                     outbox.publish()  # to robots that were just heard, before the wait
                     _receive(listener, sender, _until_due(sender, has_heartbeats=heartbeats is not None))
+                    _drop_other_spelling(sender)
                     outbox.publish()
                     report.connection(
                         "" if transport.state is State.CONNECTED else transport.problem or "no connection"
@@ -185,9 +190,17 @@ def _heartbeats(target: Target, *, every: bool) -> Iterator[Heartbeats | None]:
         yield heartbeats
 
 
-def _listen(transport: Transport, base: str) -> tuple[Listener, threading.Thread]:
+def _drop_other_spelling(sender: StopSender) -> None:
+    """Stop no more the robot whose name only looks like that of the one that was heard."""
+    heard = [base for base, robot in sender.robots.items() if robot.live or robot.estop.has_capabilities]
+    if sender.order.named and heard:
+        sender.robots = {base: sender.robots[base] for base in heard}
+
+
+def _listen(transport: Transport, bases: list[str]) -> tuple[Listener, threading.Thread]:
     """Subscribe on a thread, so that a slow network does not delay the stop; return the listener and the thread."""
-    filters = [channel.filter(base) for channel in (ESTOP_STATE, CAPABILITIES, STATUS, ONLINE, *SYNONYMS)]
+    channels = (ESTOP_STATE, CAPABILITIES, STATUS, ONLINE, *SYNONYMS)
+    filters = [channel.filter(base) for base in bases for channel in channels]
     listener = Listener(transport, ())
 
     def subscribe() -> None:
@@ -254,7 +267,7 @@ class _Report:
     def connection(self, problem: str) -> None:
         """Warn of an outage, once."""
         if problem and not self._problem:
-            _echo(f"pebble: warning: nothing is sent until there is a connection again: {problem}", err=True)
+            _echo(f"pebble: warning: nothing is sent until there is a connection: {problem}", err=True)
         self._problem = problem
 
     def update(self, now: float) -> None:
@@ -308,6 +321,8 @@ def _line(robot: RobotStop, *, is_early: bool, sent: bool) -> str:
             return "old firmware: NOT LATCHED, zeros are no longer sent"
         case Progress.SPARED:
             return "does not drive"
+        case Progress.NOT_CONFIRMED if not sent:
+            return "STOP NOT SENT: there was no connection"
         case Progress.NOT_CONFIRMED:
             return f"NOT CONFIRMED, no longer sent: {_why(robot)}"
     if is_early:
@@ -333,20 +348,22 @@ def _reset(target: Target) -> int:
     Messages of the robot come on a connection of their own if possible, so that they do not delay the reset.
     """
     with connected(target) as (transport, names), listening(target, transport) as receiving:
-        view, name = RobotView(names.base), shown(id_of(names.base))
-        robot = view.estop
+        views = [RobotView(base) for base in spellings(names.base)]
+        for view in views:
+            view.estop.subscribe(receiving)
+        wait_for(lambda: any(view.estop.has_capabilities for view in views), _ANSWER_S)
+        view = next((view for view in views if view.estop.has_capabilities), views[0])
+        robot, name = view.estop, shown(id_of(view.estop.base))
 
         def is_named(base: str) -> bool:
             """True if it is this robot, and it takes commands only at topics with the sender's name."""
             return base == robot.base and robot.named
 
         put_account_into_topics(transport, names, is_named)
-        robot.subscribe(receiving)
         # for ``view.pace`` and ``view.driveable``, the longer one where it delays no answer; times do not matter
         for channel, connection in ((LINK, receiving), (STATUS, transport)):
             take = partial(view.receive, channel, now=0.0, wall=0.0)
             connection.subscribe(channel.topic(robot.base), take, direct=True)
-        wait_for(lambda: robot.has_capabilities, _ANSWER_S)
         receiving.ask(robot.missing)  # stop states: the capabilities that list the owners may just have come
         wait_for(lambda: not robot.missing, _ANSWER_S)
         if not robot.states:

@@ -17,7 +17,7 @@ from pebble.extensions.recordings.commands.report import errors_of_files, period
 from pebble.extensions.recordings.files.reader import RecordingFile
 from pebble.extensions.recordings.files.recorded import Recorded, RecordingError, finished_path
 from pebble.extensions.recordings.files.rewrite import Keeps, rewrite
-from pebble.extensions.recordings.library import ACTIVE, FOREVER_NS, SUFFIX, files, robot_of
+from pebble.extensions.recordings.library import ACTIVE, FOREVER_NS, SUFFIX, files, is_of
 from pebble.extensions.recordings.recorder.finisher import mend as mend_leftover
 from pebble.extensions.recordings.recorder.folder import DAMAGED, Folder
 from pebble.extensions.recordings.traffic.index import index_path
@@ -63,7 +63,7 @@ def rm(
 
     def keeps(message: Recorded) -> bool:
         is_inside = since_ns <= message.log_ns < until_ns
-        return not is_inside or (base is not None and robot_of(message.channel.topic) != base)
+        return not is_inside or (base is not None and not is_of(message.channel.topic, base))
 
     if not folder.is_dir():
         raise PebbleError(f"{folder}: there is no such folder")

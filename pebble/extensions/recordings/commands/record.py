@@ -2,7 +2,6 @@
 
 import logging
 import re
-import shutil
 import sys
 import time
 from contextlib import ExitStack, suppress
@@ -63,7 +62,6 @@ def record(
         rotate_seconds=seconds(rotate),
         keep_bytes=size(keep),
         keep_media_days=seconds(keep_media) / 86_400,
-        free_bytes=_free_bytes(into),
         media=media,
     )
     kind, transport, names, where = resolve(target)
@@ -78,12 +76,6 @@ def record(
         _run(recorder, Source(recorder, kind, transport, chosen), where, length)
     _print_end(recorder, into)
     return 0
-
-
-def _free_bytes(into: Path) -> int:
-    """Return how much of the disk must stay free: the default, or a tenth of a small disk."""
-    place = next(path for path in (into, *into.absolute().parents) if path.exists())
-    return min(Options().free_bytes, shutil.disk_usage(place).total // 10)
 
 
 def _run(recorder: Recorder, source: Source, where: str, length: str | None) -> None:

@@ -5,6 +5,7 @@ import os
 import shutil
 import stat
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -47,7 +48,8 @@ def rewrite(source: Path, target: Path, *, keeps: Keeps = lambda _message: True)
         _check(part, copy)
         status = source.stat()
         set_mode(part, stat.S_IMODE(status.st_mode))
-        os.utime(part, ns=(status.st_atime_ns, status.st_mtime_ns))
+        with suppress(OSError):  # some shares let only the owner set times
+            os.utime(part, ns=(status.st_atime_ns, status.st_mtime_ns))
         part.replace(target)
     finally:
         part.unlink(missing_ok=True)
@@ -95,7 +97,8 @@ def write_copy(messages: Iterable[Recorded], out: File) -> int:
 
 def _copy(source: Path, part: Path, keeps: Keeps, *, complete: bool) -> Rewritten:
     """Write the copy. Raises OSError, and RecordingError if it must be ``complete`` and is not."""
-    if shutil.disk_usage(part.parent).free < source.stat().st_size:
+    room = shutil.disk_usage(part.parent)
+    if room.total and room.free < source.stat().st_size:  # some shares tell no sizes
         raise OSError(errno.ENOSPC, f"there is no room for a copy of {source.name}", str(part.parent))
     left_out = 0
     with RecordingFile(source) as file, part.open("xb", buffering=0) as out:

@@ -15,6 +15,11 @@ class Disk:
 
     free_bytes: int
     has_inodes: bool = True
+    size_bytes: int = 1 << 60
+
+    def wanted_bytes(self, options: Options) -> int:
+        """Return how much must stay free: a tenth of a small disk, and nothing of a share that tells no sizes."""
+        return min(options.free_bytes, self.size_bytes // 10)
 
 
 def surplus(entries: Iterable[Entry], options: Options, disk: Disk) -> list[Entry]:
@@ -28,7 +33,7 @@ def surplus(entries: Iterable[Entry], options: Options, disk: Disk) -> list[Entr
     deleted = []
     for entry in _deletable(listed):
         is_too_much = options.keep_bytes and used > options.keep_bytes
-        if not is_too_much and free >= options.free_bytes and has_inodes:
+        if not is_too_much and free >= disk.wanted_bytes(options) and has_inodes:
             break
         deleted.append(entry)
         used -= entry.size

@@ -14,7 +14,7 @@ from typing import BinaryIO, Final
 
 from pebble.extensions.recordings.files.recorded import ACTIVE, SUFFIX, RecordingError
 from pebble.extensions.recordings.files.rewrite import PART
-from pebble.runtime.as_owner import as_owner
+from pebble.runtime.as_owner import as_owner, require_own
 from pebble.runtime.whole_file import sync_folder
 from pebble.transports.own_file import OwnFile
 
@@ -66,11 +66,13 @@ class Folder:
         self._lock_file = OwnFile(root / LOCK)
 
     def take(self) -> None:
-        """Create the folder and lock it against a second recorder. Raises RecordingError."""
+        """Create the folder and lock it against a second recorder. Raises PebbleError."""
+        require_own(self.root)
         try:
             self.root.mkdir(mode=0o750, parents=True, exist_ok=True)
         except OSError as error:
             raise RecordingError(f"{self.root}: {error.strerror}: name another folder") from None
+        require_own(self.root)  # another user may have been faster
         problem = f"{self.root}: a recorder writes here: stop it first, or name another folder"
         self.is_locked = self._lock.enter_context(_locked(self.root / LOCK, problem))
         self._lock_file = OwnFile(self.root / LOCK)  # the file that is locked now
@@ -89,7 +91,7 @@ class Folder:
 
     @contextmanager
     def taken(self) -> Iterator[None]:
-        """Hold the lock during the block, so that no recorder starts. Raises RecordingError."""
+        """Hold the lock during the block, so that no recorder starts. Raises PebbleError."""
         self.take()
         try:
             yield
@@ -161,7 +163,7 @@ def _locked(path: Path, problem: str) -> Iterator[bool]:
             raise RecordingError(problem) from None
         except OSError as error:
             text = "%s cannot be locked (%s): see that nothing else records into its folder, which is not noticed"
-            log.warning(text, path, error.strerror)
+            log.error(text, path, error.strerror)
             is_locked = False
         yield is_locked
 

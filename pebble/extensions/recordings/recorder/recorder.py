@@ -51,7 +51,7 @@ class Recorder:
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
 
     def start(self) -> None:
-        """Start. Raises RecordingError if the folder cannot be used or the package ``mcap`` is not installed."""
+        """Start. Raises PebbleError if the folder cannot be used or the package ``mcap`` is not installed."""
         require_package()
         self.folder.take()
         leftovers = self._writing.mend_leftovers()

@@ -9,7 +9,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from pebble.extensions.recordings.files.recorded import RecordingError
+from pebble.errors import PebbleError
 from pebble.extensions.recordings.recorder.background import Background
 from pebble.extensions.recordings.recorder.clock import Due, RecordingClock
 from pebble.extensions.recordings.recorder.disk_space import Disk, outdated, surplus
@@ -226,8 +226,8 @@ class Writing:
     def check_space(self, due: Due, *, now_s: float) -> None:
         """Look at the disk if that is due; delete files for room, and stop or resume writing.
 
-        With less than ``free_bytes`` free, old files are deleted. With less than half of that, nothing is written until
-        ``free_bytes`` are free again.
+        With less free than is wanted, old files are deleted. With less than half of that, nothing is written until as
+        much is free again.
         """
         if not (due.every("space", _SPACE_S) or self._changed):
             return
@@ -235,28 +235,29 @@ class Writing:
         try:
             self._follow_folder()
             disk = _disk(self._folder.root)
-        except RecordingError as error:
+        except PebbleError as error:
             self._stand_still(str(error))
             return
         except OSError as error:
             self._stand_still(f"{self._folder.root}: {error.strerror}")
             return
-        if disk.free_bytes < options.free_bytes or not disk.has_inodes or self._changed or due.every("list", _LISTED_S):
+        wanted = disk.wanted_bytes(options)
+        if disk.free_bytes < wanted or not disk.has_inodes or self._changed or due.every("list", _LISTED_S):
             self._changed = False
             self._make_room(disk, due, now_s)
         if due.every("finish", _LISTED_S):
             self._finisher.retry()
         # ``disk`` is as before the deletions: whether there is room again shows at the next look.
-        if disk.free_bytes < options.free_bytes // 2 or not disk.has_inodes:
+        if disk.free_bytes < wanted // 2 or not disk.has_inodes:
             self.flush()
             self.rotate(all_of_them=True)  # while there is room to finish them
-            free, wanted = disk.free_bytes >> 20, options.free_bytes >> 20
-            self._stand_still(f"the disk is full ({free} MB are free, and {wanted} MB must stay)", full=True)
-        elif self._blocked is not None and (disk.free_bytes >= options.free_bytes or not self._blocked.is_full):
+            free_mb, wanted_mb = disk.free_bytes >> 20, wanted >> 20
+            self._stand_still(f"the disk is full ({free_mb} MB are free, and {wanted_mb} MB must stay)", full=True)
+        elif self._blocked is not None and (disk.free_bytes >= wanted or not self._blocked.is_full):
             self.try_again()
 
     def _follow_folder(self) -> None:
-        """Use the folder that is now at the path. Raises RecordingError and OSError."""
+        """Use the folder that is now at the path. Raises PebbleError and OSError."""
         if self._folder.in_place:
             return
         self.flush()  # forgets the files that are not there any more
@@ -291,4 +292,5 @@ class Writing:
 
 def _disk(root: Path) -> Disk:
     about = os.statvfs(root)
-    return Disk(about.f_bavail * about.f_frsize, about.f_files == 0 or about.f_favail > 0)
+    has_inodes = about.f_files == 0 or about.f_favail > 0
+    return Disk(about.f_bavail * about.f_frsize, has_inodes, about.f_blocks * about.f_frsize)

@@ -80,10 +80,18 @@ class Doubles(Fault):
 class Floods(Fault):
     """Sends 30 MB after each subscription."""
 
+    flood = packet(PUBLISH, b"\0\1x" + bytes(1_000_000))
+
     def up(self, first: int, body: bytes) -> list[bytes]:
         if kind(first) == SUBSCRIBE:
-            self.answers += [packet(PUBLISH, b"\0\1x" + bytes(1_000_000))] * 30
+            self.answers += [self.flood] * 30
         return super().up(first, body)
+
+
+class FloodsWithAnswers(Floods):
+    """Answers 30,000 pings after each subscription."""
+
+    flood = packet(PINGRESP, b"") * 1000
 
 
 class Mute(Fault):
@@ -191,6 +199,7 @@ FAULTS = [
     (HidesRetained, "rights", "without the retain flag"),
     (Doubles, "overlapping filters", "2 copies"),
     (Floods, "rights", "without end"),
+    (FloodsWithAnswers, "rights", "without end"),
     further(Mute, "answers to pings", "does not answer"),
     (EagerPongs, "answers to pings", "before it has passed on what came before"),
     (SendsBack, "bridge mode", "own messages come back"),

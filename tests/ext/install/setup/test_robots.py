@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import os
@@ -41,7 +42,7 @@ from tests.ext.install.setup.conftest import (
     tar_of,
     tree,
 )
-from tests.support import Child, beside, free_port, listening, needs_root, until
+from tests.support import Child, beside, free_port, listening, needs_root, refused, until
 
 HEAD = (ABOUT, b'{"format": 1, "version": "0", "id": "a"}')
 GOOB, FRED = Identity("pebble", "robots", "goob"), Identity("pebble", "robots", "fred")
@@ -150,7 +151,9 @@ def test_a_backup_on_a_blank_machine_is_the_same_robot(
     (places.state / "estop-serial-pebble+robots+goob.json").write_text('{"stopped": true}')
     wanted = tree(root)
     backup = tmp_path / "goob.tar"
-    assert run("setup", "--backup", backup) == 0
+    with monkeypatch.context() as share:  # on one that lacks this call
+        share.setattr("os.fsync", refused(errno.EINVAL))
+        assert run("setup", "--backup", backup) == 0
     other = machine_root(tmp_path / "other")
     at(other, monkeypatch)
     assert run("setup", "--from", backup) == 1, "systemd does not run there"
@@ -344,6 +347,7 @@ FOREIGN: dict[str, tuple[bytes, str]] = {
     "a link": (tar_of(HEAD, ("etc/x", b""), kind=tarfile.SYMTYPE), "is not what a backup has"),
     "a hole": (tar_of(HEAD, ("etc/x", b""), kind=tarfile.GNUTYPE_SPARSE), "is not what a backup has"),
     "a device": (tar_of(HEAD, ("etc/x", b""), kind=tarfile.CHRTYPE), "is not what a backup has"),
+    "a long name": (tar_of(HEAD, (f"etc/{'x' * 256}", b"x")), "is not what a backup has"),
     "a broken name": (tar_of(HEAD, ("etc/./x", b"x")), "is not what a backup has"),
     "twice": (tar_of(HEAD, ("etc/x", b"1"), ("etc/x", b"2")), "is in it twice"),
 }

@@ -7,6 +7,7 @@ import os
 import pty
 import re
 import signal
+import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -76,9 +77,10 @@ def test_a_stop_reaches_a_living_address_behind_dead_ones(robot_on: Make, broker
     assert (stop.returncode, robot.latched) == (0, True), out + err
 
 
-def test_a_stop_is_confirmed_by_every_owner(run: Run, robot_on: Make, url: str) -> None:
-    robot = robot_on("left", "right")
-    assert run("estop", robot.id, url, "--why", "dog") == 0
+@pytest.mark.parametrize("id_", ["", "b\u00e4r", "ba\u0308r"])  # of two letters that look like one
+def test_a_stop_is_confirmed_by_every_owner(run: Run, robot_on: Make, url: str, id_: str) -> None:
+    robot = robot_on("left", "right", id_=id_)
+    assert run("estop", "b\u00e4r" if id_ else robot.id, url, "--why", "dog") == 0
     assert robot.latched
     assert run.out.splitlines()[-1].startswith(f"{robot.id}: stopped and confirmed after 0.")
     latch = robot.motors.owners[0].latch
@@ -205,6 +207,19 @@ def test_a_hold_stops_robots_that_come_online_later(robot_on: Make, url: str) ->
     assert f"{late.id}: was stopped, and reset since" in out
 
 
+def await_stop(process: subprocess.Popen[str], broker: Broker, robot: RecordingRobot) -> None:
+    """Start the broker once the command says that it waits, and await the confirmation."""
+    assert process.stderr is not None
+    assert process.stderr.readline().startswith("pebble: warning: nothing is sent until there is a connection: ")
+    robot.deaf = False
+    broker.start()
+    out, _ = process.communicate(timeout=50)
+    robot.close()
+    broker.stop()
+    assert process.returncode == 0, out
+    assert robot.latched
+
+
 def test_a_lost_broker_is_waited_for(tmp_path: Path) -> None:
     broker = Broker(tmp_path)
     robot = RecordingRobot(broker.port, "pebble/robots/lost", heartbeats=False)
@@ -213,17 +228,15 @@ def test_a_lost_broker_is_waited_for(tmp_path: Path) -> None:
     with running("estop", robot.id, f"--url=mqtt://127.0.0.1:{broker.port}") as process:
         assert until(lambda: robot.count("estop") >= 1)
         broker.kill()
-        assert process.stderr is not None
-        assert process.stderr.readline().startswith(
-            "pebble: warning: nothing is sent until there is a connection again"
-        )
-        robot.deaf = False
-        broker.start()
-        out, _ = process.communicate(timeout=50)
-    robot.close()
-    broker.stop()
-    assert process.returncode == 0, out
-    assert robot.latched
+        await_stop(process, broker, robot)
+
+
+def test_a_broker_that_restarts_is_waited_for(tmp_path: Path) -> None:
+    broker = Broker(tmp_path)
+    robot = RecordingRobot(broker.port, "pebble/robots/lost", heartbeats=False)
+    broker.kill()
+    with running("estop", robot.id, f"--url=mqtt://127.0.0.1:{broker.port}") as process:
+        await_stop(process, broker, robot)
 
 
 #: What a broker keeps, too long to arrive, of a stranger or of the robot itself, and who stops the robot all the same.
@@ -315,10 +328,11 @@ def terminal() -> Iterator[tuple[int, int]]:
         os.close(end)
 
 
-def test_a_reset_shows_who_stopped_the_robot_and_frees_it(run: Run, robot_on: Make, url: str) -> None:
-    robot = robot_on("left", "right")
+@pytest.mark.parametrize("id_", ["", "ba\u0308r"])
+def test_a_reset_shows_who_stopped_the_robot_and_frees_it(run: Run, robot_on: Make, url: str, id_: str) -> None:
+    robot = robot_on("left", "right", id_=id_)
     robot.stop(by="ann@desk", why="dog")
-    assert run("estop", "reset", robot.id, url) == 0
+    assert run("estop", "reset", "b\u00e4r" if id_ else robot.id, url) == 0
     lines = run.out.splitlines()
     assert lines[0].startswith(f"{robot.id}: stopped by ann@desk, ")
     assert all(line.endswith(f": dog ({owner})") for line, owner in zip(lines, ("left", "right"), strict=False))

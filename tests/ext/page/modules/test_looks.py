@@ -218,8 +218,11 @@ NOTICES: Rows = {
     "a battery that hovers around the limit is listed once, and again once it was charged": ("""
         level([50], [19.5], [20.5], [18]); result = [...texts(), notices.fresh.length];
         level([30], [12], [21], [19], [21], [19]); result.push(notices.fresh.length);
-        level([30, true], [12], [11]); level([90], [12], [11]); level([30], [12, true], [null]);
+        level(...Array(5).fill([30, true]), [12], [11]); level([90], [12], [11]); level([30], [12, true], [null]);
         result.push(notices.fresh.length);""", ["a has a low battery: 18 %", 1, 1, 3]),
+    "a contact of its charger that flaps is no charge": (
+        "for (const charging of [false, true, true, false, true, false, false]) level([12, charging], [11, charging]);"
+        "result = notices.fresh.length;", 1),
     "one reading of a battery is no event": ("level([80], [0], [80], [19], [26], [19], [80], [0]);", []),
     "a service that ends again and again": ("""
         const services = (state, restarts, last_exit) => see("a", "service", { imu: { state, restarts, last_exit } });

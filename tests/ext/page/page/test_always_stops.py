@@ -85,6 +85,13 @@ def test_a_page_that_loses_a_file_stops_robots(
             opened.context.unroute_all(behavior="ignoreErrors")
 
 
+def test_stop_is_red_from_the_first_where_people_choose_all_colours(browser: Browser, server: CannedServer) -> None:
+    server.show(STATES["fleet"])
+    later = {"**/panels.css": lambda route: route.abort(), "**/*.*/panels.css": lambda route: route.abort()}
+    with tab(browser, server.url, routes=later, forced_colors="active") as opened:
+        assert opened.until(_SHOWS)
+
+
 def test_its_stop_is_a_form_that_the_server_takes(browser: Browser, served: Served, robot: RecordingRobot) -> None:
     lost = {"**/main.js": lambda route: route.abort(), "**/*.*/main.js": lambda route: route.abort()}
     with served.page() as other, tab(browser, served.origin, script=_SOON, routes=lost) as opened:
@@ -127,6 +134,19 @@ def test_what_a_browser_denies_keeps_no_page_from_its_server(show: Show, server:
         opened.page.keyboard.press("Control+Space")
         assert opened.until(lambda: any(op.get("op") == "estop" for op in server.received))
         assert opened.errors == []
+
+
+_REPLACE = """() => {
+  const text = document.createTreeWalker(document.querySelector("#app"), NodeFilter.SHOW_TEXT).nextNode();
+  const font = document.createElement("font"); font.textContent = text.data; text.replaceWith(font); }"""
+
+
+def test_an_extension_that_replaces_texts_is_named(show: Show) -> None:
+    with show(STATES["driving"], when="window.pebble?.driver.pads") as opened:
+        opened.page.wait_for_timeout(500)
+        assert "An extension" not in opened.page.evaluate(_WORDS)
+        opened.page.evaluate(_REPLACE)
+        assert opened.until(f"{_WORDS}.includes('An extension of this browser replaces texts')")
 
 
 def test_without_sockets_the_page_has_no_connection_and_stops_by_a_request(show: Show, server: CannedServer) -> None:

@@ -34,6 +34,9 @@ BOTH = [*STATE, *(entry(number, MEDIA) for number in (2, 4, 6))]
         ([*STATE, entry(9, ending=".active")], Options(keep_bytes=35), MUCH, [1]),
         ([*STATE, entry(9, ending=".damaged")], Options(keep_bytes=35), MUCH, []),
         (BOTH, Options(free_bytes=115), Disk(100), [2, 4]),
+        (BOTH, Options(free_bytes=115), Disk(100, size_bytes=1000), []),
+        (BOTH, Options(free_bytes=115), Disk(95, size_bytes=1000), [2]),
+        (BOTH, Options(free_bytes=115), Disk(0, size_bytes=0), []),
         (BOTH, Options(free_bytes=0), Disk(100, has_inodes=False), [2]),
     ],
 )

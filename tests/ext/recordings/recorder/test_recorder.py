@@ -377,8 +377,9 @@ class TestDisk:
         assert running.recorder.counters["dropped"] == 70
         assert len(payloads(running.root)) == 20
 
-    def test_no_room_from_the_start(self, tmp_path: Path) -> None:
-        running = Running(tmp_path / "rec", Options(free_bytes=1 << 60))
+    def test_no_room_from_the_start(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("os.statvfs", lambda _: os.statvfs_result((4096, 4096, 9000, 9, 9, 9, 9, 9, 0, 255)))
+        running = Running(tmp_path / "rec", Options())
         assert until(lambda: "the disk is full" in running.recorder.blocked)
         running.stop()
 

@@ -58,10 +58,10 @@ const EVENTS = {
   /** Of a battery that is not charged: once, and again only after it was. The state is how many readings were below. */
   battery(before = 0, percent, charging) {
     if (percent === null) return null;
-    const isAbove = before < READINGS && percent >= LOW_PERCENT + MARGIN;
-    if (charging || isAbove || percent >= CHARGED_PERCENT) return { state: 0 };
+    if (charging && before >= READINGS && before < 3 * READINGS) return { state: before + 1 }; // its contact may flap
+    if (charging || percent >= (before < READINGS ? LOW_PERCENT + MARGIN : CHARGED_PERCENT)) return { state: 0 };
     const state = Math.min(READINGS, before + Number(percent < LOW_PERCENT));
-    return { state, text: state === READINGS ? `has a low battery: ${Math.round(percent)} %` : "" };
+    return { state, text: before < READINGS && state === READINGS ? `has a low battery: ${Math.round(percent)} %` : "" };
   },
 };
 
