@@ -4,6 +4,7 @@ import selectors
 import signal
 import time
 from collections.abc import Callable
+from math import inf
 from types import FrameType
 
 from pebble.runtime.timers import Timer, Timers
@@ -69,7 +70,7 @@ class Reactor:
                 now = self.now()
                 if end is not None and now >= end:
                     return False
-                self._turn(self._timers.wait(now), None if end is None else end - now)
+                self._turn(min(self._timers.next_due, inf if end is None else end) - now)
             return True
         finally:
             self._read_at = None
@@ -77,9 +78,9 @@ class Reactor:
     def close(self) -> None:
         self._selector.close()
 
-    def _turn(self, *waits: float | None) -> None:
+    def _turn(self, wait_s: float) -> None:
         """Run the jobs of readable descriptors, then timers: a timer that checks for life needs the newest signs."""
-        for key, _ in self._selector.select(min([_TURN_S, *(wait for wait in waits if wait is not None)])):
+        for key, _ in self._selector.select(max(0.0, min(_TURN_S, wait_s))):
             if key.fd in self._selector.get_map():  # an earlier job of this turn may have forgotten it
                 key.data()
         self._timers.run_due(self.now())
