@@ -77,6 +77,11 @@ def decode(channel: Channel, raw: bytes, remark: Remark | None = None) -> Any:
         if issubclass(channel.payload, p.LightsSolid):
             decoded = {key: value for key, value in decoded.items() if key != "group" or isinstance(value, bool)}
             return msgspec.convert(decoded | _numbers(channel, decoded, remark or _ignore), channel.payload)
+        if issubclass(channel.payload, p.Switch) and isinstance(decoded, dict):
+            action, stops = decoded.get("action"), decoded.get("enabled") is False
+            stop = channel.payload(action=action if isinstance(action, str) else None, enabled=False if stops else None)
+            if stop.ends():  # whatever else is wrong in it
+                return stop
         raise PayloadError(f"{channel.metric}: {error}") from None
 
 

@@ -9,8 +9,9 @@ _NAMES = ("SIGINT", "SIGTERM", "SIGHUP")  # the last one is unknown to Windows
 
 
 def ending_signals() -> list[signal.Signals]:
-    """Return the signals that end a program on this system."""
-    return [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
+    """Return the signals that end a program on this system; without SIGHUP if that is ignored, as under nohup."""
+    numbers = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
+    return [number for number in numbers if number.name != "SIGHUP" or signal.getsignal(number) is not signal.SIG_IGN]
 
 
 class EndSignal:

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from pebble.errors import NotRunningError, PayloadError, PebbleError
 from pebble.extensions.media.frames import FrameInfo, FrameWriter
-from pebble.extensions.media.jpeg import jpeg_size
+from pebble.extensions.media.jpeg import SCAN, jpeg_size
 from pebble.services.av_daemon.health import NOTHING, Health
 from pebble.services.av_daemon.source import Bytes, Capture, Source
 
@@ -148,10 +148,13 @@ def _with_real_size(info: FrameInfo, data: Bytes) -> FrameInfo:
 def _content(info: FrameInfo, data: Bytes) -> int | str:
     """Return a checksum of the frame's bytes; NOTHING for sound that is all zeros, as of a muted microphone.
 
-    Of a large frame only some bytes are read, because in a camera's frames all bytes change.
+    Of a large frame only some bytes are read, because in a camera's frames all bytes change; of a JPEG those of the
+    picture, as its header may hold a time.
     """
     if info.rate and not data.any():
         return NOTHING
+    if info.format == "mjpeg":
+        data = data[max(0, data.tobytes().find(SCAN)) :]
     return crc32(data[:: data.size // _LOOKED_AT + 1].tobytes())
 
 

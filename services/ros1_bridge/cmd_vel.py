@@ -23,6 +23,7 @@ ZEROS = 5  # after the last command; then silence, so that other programs of ROS
 LATCHED_S = 0.1  # between two zeros while stopped
 SILENT_S = 1.0  # a base that sent odometry, and sends none for so long, hangs
 _PERIOD_S = 0.05  # between two repetitions, where the config says 0
+_SURE_S = 2.0  # a subscriber that is still there so long after "unlocked" was sent has received it
 _CANCEL_S = 1.0  # between two cancellations of a navigation that goes on
 _END_S = 1.0  # longest wait for the thread at the end
 
@@ -58,6 +59,7 @@ class CmdVel:
         self._latched = False
         self._owed = owed  # as stored
         self._has_set_lock = owed  # then a new subscriber of the lock is told its state
+        self._unlocked_at = inf  # when the lock was last sent as open
         self._heard_at: float | None = None  # when the base last sent odometry
         self._cancelled_at = float("-inf")  # when the planner's goals were last cancelled
         self._ends = False  # the thread is to end
@@ -138,6 +140,7 @@ class CmdVel:
             self._body, self._until, self._zeros = ZERO, 0.0, ZEROS
             self._out.send(ZERO)
             self._has_set_lock = True  # from the first lock on, new subscribers are told the state
+            self._unlocked_at = inf
             self._send_lock()
             if latched:
                 self._owe(True)  # does not wait for the disk: another thread writes the file
@@ -166,13 +169,19 @@ class CmdVel:
         """Return the lock's state for a new subscriber; None if it was never set. Called on the thread of sockets."""
         if not self._has_set_lock:
             return None
-        if not self._latched:
-            self._owe(False)
+        self._unlocked_at = inf if self._latched else time.monotonic()
         return messages.boolean(self._latched)
 
     def _send_lock(self) -> None:
         if self._lock is not None and self._lock.send(messages.boolean(self._latched)) and not self._latched:
-            self._owe(False)
+            self._unlocked_at = time.monotonic()
+
+    def settle(self) -> None:
+        """Owe nothing more once a subscriber has had time to receive that the lock is open, and is still connected."""
+        with self._changed:
+            was_told = time.monotonic() - self._unlocked_at > _SURE_S
+            if self._lock is not None and self._lock.names and was_told and not self._latched:
+                self._owe(False)
 
     def _send(self) -> None:
         """Send the command; a base that hangs gets zeros, so that it does not move when it goes on."""

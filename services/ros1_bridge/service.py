@@ -132,6 +132,7 @@ class Ros1Bridge(Ros1Reader, MotorOwner):
         """Tell the launcher whether the ROS base can be driven. Raises DeviceError if nothing drives it any more."""
         if not self.cmd_vel.alive:
             raise DeviceError("the thread that sends commands has ended")
+        self.cmd_vel.settle()
         report = self.assess()
         self._reported.report(*report)
         if report != self._shown:

@@ -103,6 +103,10 @@ MEANINGS: list[tuple[Channel, bytes, Any]] = [
     # a soundboard command is a boolean or an object
     *((c.SOUNDBOARD_COMMAND, raw, SoundboardCommand(**fields)) for raw, fields in SOUNDS.items()),
     (c.AUTONOMY_COMMAND, b"false", AutonomyCommand(enabled=False)),
+    # a stop is one whatever else is wrong in it
+    (c.AUTONOMY_COMMAND, b'{"action": "Stop", "config": "", "file": 5}', AutonomyCommand(action="Stop")),
+    (c.AUTONOMY_COMMAND, b'{"enabled": false, "by": 5}', AutonomyCommand(enabled=False)),
+    (c.SOUNDBOARD_COMMAND, b'{"action": "off", "enabled": 1, "repeat": "x"}', SoundboardCommand(action="off")),
     (c.AUTONOMY_COMMAND, FOLLOW, FOLLOWS),
     (c.AUTONOMY_COMMAND, b'{"value": ' + FOLLOW + b"}", FOLLOWS),
     (c.ESTOP_RESET, b'{"boot": "a1b2c3d4", "count": 3}', EstopReset(boot="a1b2c3d4", count=3)),

@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 LOSSES = 3  # of connections in a row, after which a topic is withheld
 QUIET_S = 2.0  # after a loss, before a topic is tried
 RETRY_S = 60.0  # between two trials of a topic that is at fault
-LARGE = 4096  # bytes from which the size of a message is the most likely reason: smaller ones are still sent
+LARGE = 1024  # bytes from which the size of a message is the most likely reason: smaller ones are still sent
 _NOT_TAKEN_S = 600.0  # between two log lines about one topic
 
 

@@ -13,7 +13,7 @@ MAX_EDGE: Final = 4096  # pixels
 
 SOI: Final = b"\xff\xd8"
 _EOI: Final = b"\xff\xd9"
-_SCAN: Final = b"\xff\xda"
+SCAN: Final = b"\xff\xda"
 _MAX_SCANS: Final = 32  # progressive pictures have about ten; each costs a pass over the whole picture
 _SIZES: Final = (0xC0, 0xC1, 0xC2)  # SOF of baseline, extended and progressive Huffman: what libjpeg decodes everywhere
 
@@ -66,5 +66,5 @@ def _check(jpeg: bytes, frame: int, width: int, height: int) -> None:
         raise PayloadError(f"JPEG: {width}x{height}, larger than {MAX_EDGE}x{MAX_EDGE} or nothing")
     if jpeg.find(_EOI, frame) < 0:
         raise PayloadError("JPEG: cut short")
-    if jpeg.count(_SCAN) > _MAX_SCANS:
+    if jpeg.count(SCAN) > _MAX_SCANS:
         raise PayloadError("JPEG: too many scans")

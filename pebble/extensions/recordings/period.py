@@ -133,9 +133,10 @@ def _length_ns(age: re.Match[str]) -> int:
 
 
 def _ns(moment: datetime) -> int:
-    """Return the exact nanoseconds, unlike ``timestamp()``. A ``moment`` without a zone is in this machine's."""
+    """Return the exact nanoseconds. A ``moment`` without a zone is in this machine's."""
     try:
-        return _clipped((moment.astimezone(UTC) - _EPOCH) // timedelta(microseconds=1) * 1000)
+        whole_s = int(moment.replace(microsecond=0).timestamp())  # astimezone() is wrong where clocks skip an hour
+        return _clipped(whole_s * 10**9 + moment.microsecond * 1000)
     except (OverflowError, ValueError, OSError):  # the years 1 and 9999, near the ends of what a datetime holds
         return 0 if moment.year <= _EPOCH.year else FOREVER_NS
 

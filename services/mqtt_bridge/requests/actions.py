@@ -109,15 +109,19 @@ class Action:
         return True
 
     def _follow(self, process: "subprocess.Popen[bytes]", output: int | None, where: str) -> None:
-        """Limit the output's file while the command runs, and log its exit code."""
+        """Log the command's exit code; limit its output's file until it runs again."""
         while (code := process.poll()) is None:
             time.sleep(_LOOK_S)
             if output is not None:
                 shorten(output)
-        if output is not None:
-            os.close(output)
         level = logging.INFO if code == 0 else logging.ERROR
         self._log.log("ended", level, "%s ended with exit code %d, its output %s", self.name, code, where)
+        if output is None:
+            return
+        while self._process is process:  # programs that it has left behind may write for ever
+            time.sleep(_LOOK_S)
+            shorten(output)
+        os.close(output)
 
 
 def shorten(file: int) -> None:

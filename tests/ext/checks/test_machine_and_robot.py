@@ -8,6 +8,7 @@ import re
 import socket
 import subprocess
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -91,18 +92,32 @@ def test_a_broker_that_requires_a_login(tmp_path: Path) -> None:
     assert "falsch" not in str(wrong)
 
 
+MAY_NOT = r"may not (publish to|read) pebble/robots/goob/(outgo|incom)ing/bridge-probe"
+
+
 @pytest.mark.parametrize("protocol", ["3.1.1", "5"])
-@pytest.mark.parametrize(("allowed", "level"), [("readwrite #", State.OK), ("read #", State.FAILED)])
-def test_an_account_that_may_not_publish_is_found(tmp_path: Path, protocol: str, allowed: str, level: State) -> None:
+@pytest.mark.parametrize(
+    ("allowed", "max_qos", "level", "words"),
+    [
+        ("readwrite #", 1, State.OK, "accepts"),
+        ("read #", 1, State.FAILED, MAY_NOT),
+        ("write #", 1, State.FAILED, MAY_NOT),
+        ("readwrite +/+/+/outgoing/#\ntopic read +/+/+/incoming/#", 1, State.OK, "accepts"),
+        ("readwrite #", 0, State.WARN, "takes no QoS 1"),
+    ],
+)
+def test_an_account_that_may_not_publish_or_read_is_found(
+    tmp_path: Path, protocol: str, allowed: str, max_qos: int, level: State, words: str
+) -> None:
     (tmp_path / "acl").write_text(f"topic {allowed}\n")
-    broker = Broker(tmp_path, f"acl_file {tmp_path / 'acl'}")
+    broker = Broker(tmp_path, f"acl_file {tmp_path / 'acl'}", f"max_qos {max_qos}")
     try:
         settings = MqttSettings(host="127.0.0.1", port=broker.port, protocol=protocol)
         finding = next(robot_account("b", settings, "pebble/robots/goob"))
     finally:
         broker.stop()
     assert finding.state is level
-    assert level is State.OK or "may not publish to pebble/robots/goob/outgoing/bridge-probe" in finding.text
+    assert re.search(words, finding.text)
 
 
 def test_a_broker_that_hangs_up_on_what_is_published_is_found(broker: Broker) -> None:
@@ -166,7 +181,12 @@ ELSEWHERE = [
     *((TLS, LET_IN, LoginAttempt(code=code), ["ok", "ok", "ok"], "encrypted") for code in (4, 134, 135)),
     *((TLS, LET_IN, LoginAttempt(code=code), ["ok", "warn", "ok"], "encrypted") for code in (3, 136)),
     (TLS, LET_IN, LoginAttempt(problem="timed out"), ["ok", "warn", "ok"], "encrypted"),
-    (TLS, LoginAttempt(code=3), SHUT_OUT, ["failed", "ok", "ok"], "encrypted"),
+    (TLS, LoginAttempt(code=3), SHUT_OUT, ["failed", "ok", "ok"], "its log says why"),
+    *(
+        (TLS, LoginAttempt(code=code), SHUT_OUT, ["failed", "ok", "ok"], "set remote_mqtt.client_id")
+        for code in (2, 133)
+    ),
+    *((TLS, LoginAttempt(code=code), SHUT_OUT, ["failed", "ok", "ok"], "set protocol of") for code in (1, 132)),
     (ANY_NAME, LET_IN, SHUT_OUT, ["ok", "ok", "warn"], "set tls.insecure to false"),
     (TLS, valid_for(3), SHUT_OUT, ["ok", "ok", "warn"], "its certificate expires in 3 days"),
     (TLS, valid_for(15), SHUT_OUT, ["ok", "ok", "ok"], "encrypted, its certificate for 15 more days"),
@@ -186,13 +206,17 @@ def test_a_broker_elsewhere(
     settings = MqttSettings(host="broker.example", username="ann", password="geheim", tls=tls)
     findings = list(login.broker("b", settings))
     assert [finding.state.value for finding in findings] == states
-    assert words in f"{findings[-1].text}; {findings[-1].fix}"
+    assert words in "; ".join(f"{finding.text}; {finding.fix}" for finding in findings)
 
 
 def test_a_server_that_is_no_broker_is_a_problem() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         settings = MqttSettings(host="127.0.0.1", port=server.getsockname()[1])
-        assert "does not answer" in attempt(settings, login=True, timeout_s=0.2).problem
+        for protocol, sent in (("3.1.1", b"MQTT\x04"), ("5", b"MQTT\x05")):
+            same = replace(settings, protocol=protocol)
+            assert "does not answer" in attempt(same, login=True, timeout_s=0.2).problem
+            with server.accept()[0] as connection:
+                assert sent in connection.recv(100)
     wrong_file = MqttSettings(host="127.0.0.1", port=free_port(), tls=TlsSettings(ca_cert=Path("/nowhere/ca.pem")))
     assert attempt(wrong_file, login=True).problem != ""
     unknown = MqttSettings(host="ü" * 60, port=free_port())

@@ -84,6 +84,7 @@ def machine_in_berlin():
         ("2026-10-25T02:30+01:00", "03:00", "2026-10-25T01:30Z"),
         ("2026-10-25T02:30", "03:00", "2026-10-25T00:30Z"),  # twice that day: the first one
         ("2026-03-29", "+1d", "2026-03-28T23:00Z"),
+        ("2026-03-29T02:30", "+1d", "2026-03-29T01:30Z"),  # never that day: an hour after 01:30
     ],
 )
 @pytest.mark.parametrize("local", [None, BERLIN])

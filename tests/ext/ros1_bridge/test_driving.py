@@ -13,6 +13,7 @@ import pytest
 
 from pebble.config import Config
 from pebble.contract.payloads import Drive
+from pebble.motors.state_file import StateFile
 from pebble.services.ros1_bridge.cmd_vel import CmdVel
 from pebble.services.ros1_bridge.config import Ros1
 from pebble.services.ros1_bridge.messages import GOAL_ID, GOAL_STATUS, TWIST
@@ -141,15 +142,15 @@ def test_a_new_base_hears_a_zero_first_and_a_lock_while_it_is_stopped(husky: Hus
     up = husky.ros.start_base()
     assert until(lambda: husky.ros.locks(up))
     assert set(husky.ros.locks(up)) == {"True"}
-    husky.ros.kill("base")
-    lock = husky.bridge.cmd_vel._lock  # whose connection may end later than that of the commands
-    assert until(lambda: husky.bridge.assess()[0] == "absent" and not lock.names)
+    husky.ros.kill("base", signal.SIGSTOP)  # its system takes what is sent to it
     husky.reset()
+    husky.ros.kill("base")
     husky.end()
     husky.start()
     up = husky.ros.start_base()
     assert until(lambda: husky.ros.locks(up)), "an earlier life has locked it"
     assert set(husky.ros.locks(up)) == {"False"}
+    assert until(lambda: StateFile(husky.config.state_file("lock-ros1")).load() is False)
     husky.end()
     husky.ready()
     husky.ros.kill("base")

@@ -198,10 +198,15 @@ def test_its_end_is_logged_without_its_words_and_its_output(
 def test_the_file_of_a_command_that_floods_stays_small_and_has_its_last_words(
     make: Callable[..., Action], tmp_path: Path
 ) -> None:
+    """Also after its end, if it leaves a process behind."""
     code = "import sys, time; print('y' * 3_000_000, flush=True); time.sleep(0.6); sys.exit('fatal')"
     assert finished(make(*PYTHON, code))
-    text = (tmp_path / "git-pull.log").read_text()
+    file = tmp_path / "git-pull.log"
+    text = file.read_text()
     assert (len(text) < 100_000, text[:8], text[-6:]) == (True, "(2934465", "fatal\n")
+    later = [*PYTHON, "import time; time.sleep(1); print('z' * 3_000_000)"]
+    assert finished(make(*PYTHON, f"import subprocess; subprocess.Popen({later})"))
+    assert until(lambda: file.read_text()[-2:] == "z\n" and file.stat().st_size < 100_000)
 
 
 def test_runs_also_where_no_file_can_be_written(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

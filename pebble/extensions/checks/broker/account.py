@@ -13,6 +13,7 @@ from pebble.contract import BRIDGE_PROBE, ONLINE
 from pebble.contract.identity import SERVERS, Identity
 from pebble.contract.levels import LEVELS
 from pebble.errors import TransportError
+from pebble.extensions.checks.broker import MOSQUITTO
 from pebble.extensions.checks.broker.login_attempt import reached
 from pebble.extensions.checks.broker.messages import REFUSED, held_back
 from pebble.extensions.checks.broker.peer import BrokerTrial, Peer
@@ -33,9 +34,10 @@ def robot_account(
 ) -> Iterator[CheckResult]:
     """Publish probe messages below ``base`` and check that the broker accepts them.
 
-    No program takes a probe for anything else. ``reads``: a further filter that the broker must grant. If it is
-    given, a probe must come back within ``answer_s``; also with MQTT 3.1.1, by which a broker cannot tell a refusal.
-    Above the level ``open``, a probe in the name of another robot must not come back.
+    No program takes a probe for anything else. ``reads``: a further filter that the broker must grant. A probe must
+    come back within ``answer_s`` with MQTT 3.1.1, which tells no refusal, or if ``reads`` is given; with MQTT 5 a probe
+    among the commands must, unless it is refused. Above the level ``open``, a probe in the name of another robot must
+    not come back.
     """
     try:
         with reached(settings, "") as trial:  # "": no topic here is below it, as all are complete
@@ -44,7 +46,7 @@ def robot_account(
             must_come_back = bool(reads) or settings.protocol != "5"  # before MQTT 5 no refusal is told
             result = trial.judge(lambda trial: _rights(trial, peer, topic, reads, must_come_back=must_come_back))
             yield replace(result, what=what)
-            if result.state is State.FAILED:
+            if result.state is not State.OK:
                 return
             if level != "open":
                 yield _rules(what, trial, peer, topic)
@@ -68,11 +70,22 @@ def _rights(trial: BrokerTrial, peer: Peer, topic: str, reads: str, *, must_come
         return failed(text, "pebble fleet check; its role is page")
     peer.subscribe(topic)
     is_back, refusal = _echo(trial, peer, topic)
+    if peer.closed and _takes_qos_0(trial, topic):
+        return warn("takes no QoS 1: what is lost on the way is not sent again", f"{MOSQUITTO}max_qos 2")
     if refusal or (must_come_back and not is_back):
         why = refusal or "it does not come back (or may this account not read it?)"
         fix = f"allow it to write and read {topic.rpartition('/')[0]}/# on the broker"
         return failed(f"this account may not publish to {topic}: {why}", fix)
+    if not must_come_back and (why := _why_deaf(trial, peer, topic.replace("/outgoing/", "/incoming/"))):
+        return failed(why, "allow it to read what it subscribes to on the broker")
     return ok("accepts what this account publishes")
+
+
+def _why_deaf(trial: BrokerTrial, peer: Peer, topic: str) -> str:
+    """Publish a probe among a robot's commands; return why it is not delivered, empty if it is or is refused."""
+    peer.subscribe(topic)
+    is_back, refusal = _echo(trial, peer, topic)
+    return "" if is_back or refusal else f"this account may not read {topic}: commands and stops do not reach the robot"
 
 
 def _why_not_granted(peer: Peer, filter_: str) -> str:
@@ -83,10 +96,17 @@ def _why_not_granted(peer: Peer, filter_: str) -> str:
     return "the broker refuses it" if granted[0] >= REFUSED else ""
 
 
-def _echo(trial: BrokerTrial, peer: Peer, topic: str) -> tuple[bool, str]:
+def _takes_qos_0(trial: BrokerTrial, topic: str) -> bool:
+    """True if a probe with QoS 0 comes back."""
+    peer = trial.peer(protocol=trial.settings.protocol)
+    peer.subscribe(topic)
+    return _echo(trial, peer, topic, qos=0)[0]
+
+
+def _echo(trial: BrokerTrial, peer: Peer, topic: str, qos: int = 1) -> tuple[bool, str]:
     """Publish a probe; return whether it came back, and the broker's reason if it refused the probe."""
     payload, began = new_probe(time.time_ns() // 1_000_000), time.monotonic()
-    mid = peer.publish(topic, payload, qos=1)
+    mid = peer.publish(topic, payload, qos=qos)
 
     def refusal() -> str:
         if peer.acks.get(mid, 0) >= REFUSED:

@@ -13,9 +13,14 @@ from pebble.extensions.checks.broker.login_attempt import TIMEOUT_S, LoginAttemp
 from pebble.extensions.checks.check import SOON_DAYS
 from pebble.extensions.checks.machine import printed
 from pebble.extensions.operator.places import mosquitto_path
+from pebble.transports.mqtt import reasons
 from pebble.transports.settings import MqttSettings
 
-_REFUSED_ID = 2  # a return code of CONNACK (MQTT 3.1.1, table 3.1)
+#: How to mend what a broker refuses, by its reason; for any other its log says why.
+_FIXES = {
+    reasons.words(0x84): 'set protocol of this broker to "3.1.1" or "5", as it speaks',
+    reasons.words(0x85): "let it admit any client id, or set remote_mqtt.client_id to one that it knows",
+}
 _UNKNOWN = "does not tell whether it lets in who has no login"
 _HERE_S = 1.0  # within which an address of this machine answers
 
@@ -50,10 +55,8 @@ def _own_login(settings: MqttSettings, answer: LoginAttempt) -> CheckResult:
     if answer.code == 0:
         return ok(f"answers, and lets it in within {answer.took_ms:.1f} ms")
     why = answer.refusal
-    if answer.code == _REFUSED_ID:
-        return failed(why, "let it admit any client id, or set remote_mqtt.client_id to one that it knows")
     if not answer.refuses_login:
-        return failed(f"refuses the connection: {why}", "its log says why")
+        return failed(f"refuses the connection: {why}", _FIXES.get(why, "its log says why"))
     if settings.username is None:
         return failed(f"refuses the login: {why}", "set username and password_file of this broker")
     user = shown_user(settings.username)

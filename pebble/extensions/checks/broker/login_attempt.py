@@ -62,7 +62,7 @@ def attempt(settings: MqttSettings, *, login: bool, timeout_s: float = TIMEOUT_S
         began = time.monotonic()
         try:
             trial = BrokerTrial(settings, address, "", patience_s=timeout_s)
-            connected = trial.peer()
+            connected = trial.peer(protocol=settings.protocol)
             expires = _expiry(connected.sock)
         except TransportError as error:
             code = getattr(error, "code", None)

@@ -26,6 +26,7 @@ from pebble.extensions.operator.signals import until_ended
 from pebble.extensions.page.commands.people import TLS, PeopleOption, default_folder, register_people
 from pebble.extensions.page.config import PEOPLE, WebInterface, WebTls
 from pebble.runtime.connections import REMOTE_RECONNECT_S
+from pebble.runtime.signals import ending_signals
 from pebble.transports import MqttSettings
 
 if TYPE_CHECKING:
@@ -209,8 +210,8 @@ def _me() -> str:
 def _run(settings: WebSettings) -> int:
     from pebble.extensions.page.serve import run
 
-    if hasattr(signal, "SIGHUP"):  # the terminal was closed: end as with Ctrl-C, which stops what pages move
-        signal.signal(signal.SIGHUP, lambda *_: signal.raise_signal(signal.SIGINT))
+    for number in ending_signals()[2:]:  # SIGHUP, the terminal was closed: end as with Ctrl-C, which stops what moves
+        signal.signal(number, lambda *_: signal.raise_signal(signal.SIGINT))
     with until_ended():  # uvicorn raises SIGTERM again once it has ended in order
         run(settings, on_ready=lambda url: _print_ready(settings, url))
     return 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import os
 import signal
@@ -46,9 +47,10 @@ class Streams:
         self._thread.start()
 
     def __call__(
-        self, writer: Remembering, open_source: Callable[[], Source], *, delay: float = 0.05, rest_s: float = 0.2
-    ) -> Stream:
-        stream = Stream("camera", writer, open_source, first_delay_s=delay, rest_s=rest_s)
+        self, writer: Remembering, open_source: Callable[[], Source], *, delay: float = 0.05, rest_s: float = 0.2,
+        asked: Asked | None = None,
+    ) -> Stream:  # fmt: skip
+        stream = Stream("camera", writer, open_source, first_delay_s=delay, rest_s=rest_s, asked=asked)
         self._all.append(stream)
         return stream
 
@@ -299,6 +301,26 @@ class TestHealth:
         assert (found.problem, found.last_error, found.doing) == (problem, problem, "runs")
         device.failed("unplugged")
         assert device.report(111.0).problem is None
+
+
+@pytest.mark.parametrize("frozen", [True, False])
+def test_a_frozen_picture_is_noticed_although_its_header_changes(
+    streams: Streams, monkeypatch: pytest.MonkeyPatch, frozen: bool
+) -> None:
+    monkeypatch.setattr("pebble.runtime.source_check.REPEATS_S", 0.2)
+    count, device = itertools.count(), Device()
+
+    def grab() -> Capture:
+        time.sleep(0.005)
+        number = b"%08d" % next(count)
+        picture = b"frozen" if frozen else number
+        data = np.frombuffer(b"\xff\xd8\xff\xfe\0\x0a%b\xff\xda%b\xff\xd9" % (number, picture), np.uint8)
+        return Capture(FrameInfo(format="mjpeg"), data.size, data)
+
+    monkeypatch.setattr(device, "grab", grab)
+    stream = streams(Remembering(), device, asked=Asked())
+    assert until(lambda: next(count) > 200)
+    assert bool(report(stream).problem) is frozen
 
 
 class TestReports:

@@ -131,12 +131,18 @@ def test_a_stop_and_a_reset_say_whether_they_reach_the_motors(
 
 
 def test_a_robot_that_does_not_answer_is_reported_and_ctrl_c_ends_it(robot_on: Make, url: str) -> None:
+    """Under nohup a hangup does not."""
     robot = robot_on("serial")
     robot.deaf = True
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     with running("estop", robot.id, url) as process:
+        signal.signal(signal.SIGHUP, before)
         assert process.stdout is not None
         assert process.stdout.readline() == f"{robot.id}: stop sent\n"
         assert "not confirmed yet: serial has not confirmed" in process.stdout.readline()
+        process.send_signal(signal.SIGHUP)
+        stops = robot.count("estop")
+        assert until(lambda: robot.count("estop") > stops + 1)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=WAIT_S)
     assert out.startswith(f"{robot.id}: NOT CONFIRMED, no longer sent: serial has not confirmed")

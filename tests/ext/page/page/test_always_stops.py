@@ -136,19 +136,6 @@ def test_what_a_browser_denies_keeps_no_page_from_its_server(show: Show, server:
         assert opened.errors == []
 
 
-_REPLACE = """() => {
-  const text = document.createTreeWalker(document.querySelector("#app"), NodeFilter.SHOW_TEXT).nextNode();
-  const font = document.createElement("font"); font.textContent = text.data; text.replaceWith(font); }"""
-
-
-def test_an_extension_that_replaces_texts_is_named(show: Show) -> None:
-    with show(STATES["driving"], when="window.pebble?.driver.pads") as opened:
-        opened.page.wait_for_timeout(500)
-        assert "An extension" not in opened.page.evaluate(_WORDS)
-        opened.page.evaluate(_REPLACE)
-        assert opened.until(f"{_WORDS}.includes('An extension of this browser replaces texts')")
-
-
 def test_without_sockets_the_page_has_no_connection_and_stops_by_a_request(show: Show, server: CannedServer) -> None:
     denied = "value: function () { throw new DOMException('denied', 'SecurityError'); }"
     with show(STATES["driving"], script=_DENY % ("[window, 'WebSocket']", denied)) as opened:

@@ -16,8 +16,6 @@ const IDLE_MS = 55_000; // the server ends what is not used for a minute
 const RESTED_MS = 5000; // from then on control is given to who asks for it
 const RELOAD_MS = 5000; // where no person is there to press a button
 
-const REPLACED = "An extension of this browser replaces texts here, and they grow old: switch it off for this page";
-
 /** To be called once. @param {any} page */
 export function install(page) {
   const { driver } = page;
@@ -33,9 +31,6 @@ export function install(page) {
   new Wall(page).start();
   const missing = lacks().join(" ");
   if (missing) page.connection.show(missing);
-  const isOfOthers = ({ addedNodes, removedNodes }) => addedNodes.length && removedNodes[0] instanceof Text; // the page does not
-  const look = (changes) => changes.some(isOfOthers) && page.connection.show(REPLACED);
-  new MutationObserver(look).observe(document.body, { childList: true, subtree: true });
 }
 
 /** @param {string} by who has it now @param {number} idleMs since this page drove */
