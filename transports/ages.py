@@ -68,10 +68,7 @@ class SenderClocks(Generic[K]):
     def __init__(self, most: int, patience: Patience) -> None:
         self._most, self._patience = most, patience
         self._lock = threading.Lock()
-        self._clocks: dict[K, _Clock] = {}
-
-    def __len__(self) -> int:
-        return len(self._clocks)
+        self.clocks: dict[K, _Clock] = {}
 
     def age_s(self, key: K, sent: float, waited_s: float, now: float, late_s: float) -> float:
         """Return the seconds that a message stamped ``sent`` has waited at ``now``; learn the sender's clock from it.
@@ -80,10 +77,10 @@ class SenderClocks(Generic[K]):
         proves a difference of the clocks. Until a clock is known for 2 s (_YOUNG_S), the age is at least ``waited_s``.
         """
         with self._lock:
-            clock = self._clocks.get(key)
+            clock = self.clocks.get(key)
             if clock is None or now - clock.received_at > self._patience.silent_s or now - sent < clock.least - _JUMP_S:
                 self._make_room(key, now)
-                clock = self._clocks[key] = _Clock(sent, now)
+                clock = self.clocks[key] = _Clock(sent, now)
             else:
                 clock.receive(sent, now)
                 clock = self._clock_to_use(key, clock, sent, now, late_s)
@@ -96,19 +93,19 @@ class SenderClocks(Generic[K]):
     def is_passed(self, key: K, sent: float) -> bool:
         """True if the newest stamp is later than ``sent`` by less than a second. If by more, the clock was set back."""
         with self._lock:
-            clock = self._clocks.get(key)
+            clock = self.clocks.get(key)
             return clock is not None and clock.newest - _JUMP_S < sent < clock.newest
 
     def pass_over(self, key: K, sent: float, now: float) -> None:
         """Note the stamp of a message that is not judged, so that :meth:`is_passed` recognises older ones."""
         with self._lock:
-            clock = self._clocks.get(key)
+            clock = self.clocks.get(key)
             if clock is not None and sent - clock.newest < now - clock.received_at + _JUMP_S:
                 clock.newest = max(clock.newest, sent)
 
     def _make_room(self, key: K, now: float) -> None:
         """Forget a clock if there is no room for another sender."""
-        clocks = self._clocks
+        clocks = self.clocks
         if key not in clocks and len(clocks) >= self._most:
             replaced = min(clocks, key=lambda sender: clocks[sender].received_at)
             if now - clocks[replaced].received_at <= _IDLE_S:
@@ -129,7 +126,7 @@ class SenderClocks(Generic[K]):
         candidate.receive(sent, now)
         if now - candidate.began <= candidate.patience_s:
             return clock
-        self._clocks[key] = candidate  # late for long enough
+        self.clocks[key] = candidate  # late for long enough
         return candidate
 
 
@@ -143,11 +140,7 @@ class MessageAges:
 
     def __init__(self, boot: int, late_s: float) -> None:
         self._boot, self.late_s = boot, late_s
-        self._clocks = SenderClocks[tuple[int, str]](_CLOCKS, Patience(believed_s=5.0, set_back_s=5.0, gap_s=1.0))
-
-    def __len__(self) -> int:
-        """Return how many clocks are remembered."""
-        return len(self._clocks)
+        self.clocks = SenderClocks[tuple[int, str]](_CLOCKS, Patience(believed_s=5.0, set_back_s=5.0, gap_s=1.0))
 
     def age_s(self, boot: int, topic: str, sent: float, now: float) -> float:
         """Return the age in seconds; ``sent`` and ``now`` count since the boots of their machines.
@@ -156,4 +149,4 @@ class MessageAges:
         """
         if boot == self._boot:
             return now - sent
-        return self._clocks.age_s((boot, topic), sent, 0.0, now, self.late_s)  # 0.0: no other evidence of a wait
+        return self.clocks.age_s((boot, topic), sent, 0.0, now, self.late_s)  # 0.0: no other evidence of a wait

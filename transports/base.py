@@ -307,7 +307,7 @@ class Transport(ABC):
 
     def on_state(self, watcher: Watcher) -> None:
         """Call ``watcher`` on every change of state, in order, on a thread of the transport. It must not wait."""
-        self._changes.watch(watcher)
+        self._changes.watchers.append(watcher)
 
     def open(self, timeout: float = 5.0) -> Self:
         """Start connecting, and wait up to ``timeout`` seconds for success.
@@ -324,9 +324,9 @@ class Transport(ABC):
         except TransportError:
             self._set_state(State.CLOSED)
             raise
-        connected = self._changes.await_connected(timeout)
+        connected = self._changes.connected.wait(timeout)
         while timeout and not connected and self.untried and self.state is State.CONNECTING:
-            connected = self._changes.await_connected(_TRIED_S)
+            connected = self._changes.connected.wait(_TRIED_S)
         return self
 
     def close(self) -> None:

@@ -39,14 +39,14 @@ def addresses_of(host: str, port: int) -> list[Address]:
     return list(dict.fromkeys(Address(family, place) for family, _type, _protocol, _name, place in infos))
 
 
-def dial(address: Address, timeout: float | None = None, *, max_segment: int = 0) -> socket.socket:
-    """Return a TCP connection, whose socket keeps ``timeout`` for the TLS handshake. Raises OSError.
+def dial(address: Address, *, max_segment: int = 0) -> socket.socket:
+    """Return a TCP connection, whose socket keeps its timeout for the TLS handshake. Raises OSError.
 
     ``max_segment``: bytes of one segment; 0: the system's value.
     """
     sock = socket.socket(address.family, socket.SOCK_STREAM)
     try:
-        sock.settimeout(CONNECT_TIMEOUT_S if timeout is None else timeout)
+        sock.settimeout(CONNECT_TIMEOUT_S)
         if max_segment:
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG, max_segment)
         sock.connect(address.place)

@@ -23,22 +23,16 @@ class StateChanges:
     def __init__(self, client_id: str) -> None:
         self.lock = threading.RLock()  # held while the state changes and its watchers are called
         self._client_id = client_id
-        self._connected = threading.Event()
-        self._watchers: list[Watcher] = []
-
-    def watch(self, watcher: Watcher) -> None:
-        self._watchers.append(watcher)
-
-    def await_connected(self, timeout: float) -> bool:
-        return self._connected.wait(timeout)
+        self.connected = threading.Event()
+        self.watchers: list[Watcher] = []
 
     def notify(self, state: State) -> None:
         """Tell the watchers the new state. Call it with :attr:`lock` held."""
         if state is State.CONNECTED:
-            self._connected.set()
+            self.connected.set()
         else:
-            self._connected.clear()
-        for watcher in list(self._watchers):
+            self.connected.clear()
+        for watcher in list(self.watchers):
             try:
                 watcher(state)
             except Exception:  # foreign code on our thread

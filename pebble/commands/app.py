@@ -21,8 +21,6 @@ log = logging.getLogger(__name__)
 
 #: The command of the core.
 _CORE: Final = {"up": Offered("pebble.commands.up:up", "run a robot", "own", 20)}
-#: The base of errors of a wrong command line: typer 0.27 has no public name for it.
-_WRONG: Any = getattr(typer, "TyperException", typer.BadParameter.__base__)
 #: The headings of the help, in order; commands of other packages stand last.
 _GROUPS: Final = ("use", "own", "write", "share", "measure", "more")
 
@@ -151,7 +149,7 @@ def _values(values: Callable[[Any], list[str]], context: Any, incomplete: str) -
 def _run(arguments: list[str]) -> int:
     try:
         code = application(arguments).main(arguments, prog_name="pebble", standalone_mode=False)
-    except _WRONG as error:
+    except typer.TyperException as error:  # of a wrong command line
         context, message = getattr(error, "ctx", None), error.format_message().rstrip(".")
         if context is not None and message == "Missing command":
             typer.echo(context.get_help())

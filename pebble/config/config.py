@@ -240,7 +240,7 @@ def _classes(installed: tuple[Extension, ...]) -> tuple[type[Root], Any, tuple[R
         sections |= {key: extensions.part(place) for key, place in extension.sections.items()}
         if extension.rules:
             rules += [(section, _guarded(extension, rule)) for section, rule in extensions.part(extension.rules)]
-    file_class = tree_of(sections)
+    file_class: type[Root] = tree_of(sections)
     keys = [field for field in fields(file_class) if field.name not in Root.__struct_fields__]
     added = [(field.name, field.type, field.default) for field in keys]
     namespace = {"__doc__": Config.__doc__, "__module__": __name__}

@@ -7,7 +7,6 @@ from pathlib import Path
 from pebble.errors import PebbleError
 from pebble.ownership import read_for
 
-PASSWORD = "PEBBLE_PASSWORD"  # noqa: S105 - the name of an environment variable
 _LONGEST = 1 << 24  # bytes of a text that a person has written
 
 
@@ -36,11 +35,6 @@ def read_password(file: Path, option: str, place: Path | None = None) -> str:
         raise PebbleError(f"{option}: {error.strerror}: name a file with the password in it") from None
     except NotTextError as error:
         raise PebbleError(f"{option}: the file {error}") from None
-
-
-def password(file: Path | None) -> str | None:
-    """Return the broker's password: the text of ``file``, or the environment's value. Raises PebbleError."""
-    return os.environ.get(PASSWORD) if file is None else read_password(file, "--password-file")
 
 
 def text_of(data: bytes) -> str:

@@ -298,14 +298,11 @@ class Root(Section, frozen=True, kw_only=True):
     ] = EMPTY
 
 
-def tree_of(sections: Mapping[str, type[Section]]) -> type[Root]:
-    """Return the class of a whole file with the sections of extensions, by key: ``services.lamp`` or ``lamp``."""
-    tree: type[Root] = _with(Root, sections)
-    return tree
+def tree_of(sections: Mapping[str, type[Section]], kind: type[Section] = Root) -> Any:
+    """Return a subclass of ``kind``, by default of the class of a whole file, with the sections of extensions.
 
-
-def _with(kind: type[Section], sections: Mapping[str, type[Section]]) -> Any:
-    """Return a subclass of ``kind`` with more sections; ``services.lamp`` adds ``lamp`` to its section ``services``."""
+    They come by key: ``lamp`` is a section of ``kind``, ``services.lamp`` adds ``lamp`` to its section ``services``.
+    """
     added: list[tuple[str, Any]] = []  # keys with their annotations
     for key, section in sections.items():
         if "." not in key:
@@ -315,7 +312,7 @@ def _with(kind: type[Section], sections: Mapping[str, type[Section]]) -> Any:
         inner = {key.removeprefix(start): section for key, section in sections.items() if key.startswith(start)}
         if inner:
             section, *metas = get_args(key_field.type)  # the parts of Annotated[section, *metas]
-            added.append((key_field.name, Annotated[_with(section, inner), *metas]))
+            added.append((key_field.name, Annotated[tree_of(inner, section), *metas]))
     with_defaults = [(key, annotation, get_args(annotation)[0]()) for key, annotation in added]  # [0]: the section
     namespace = {"__doc__": kind.__doc__, "__module__": kind.__module__}
     return defstruct(kind.__name__, with_defaults, bases=(kind,), namespace=namespace, frozen=True, kw_only=True)

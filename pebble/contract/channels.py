@@ -7,7 +7,7 @@ written nowhere else. Sources: paper Tables 3.1 and A.2 to A.6.
 import math
 import re
 from enum import Enum
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 from msgspec import Struct
@@ -115,18 +115,11 @@ def _c(metric: str, kind: Kind, payload: Any, doc: str, **more: Any) -> Channel:
     return Channel(metric=metric, kind=kind, payload=payload, doc=doc, **more)
 
 
-def _serial(key: str) -> str:
-    return f"services.serial_mcu_bridge.topics.{key}"
-
-
-def _bridge(key: str) -> str:
-    return f"services.mqtt_bridge.topics.{key}"
-
-
 def _service(name: str, key: str) -> str:
     return f"services.{name}.topics.{key}"
 
 
+_serial, _bridge = partial(_service, "serial_mcu_bridge"), partial(_service, "mqtt_bridge")
 _MEDIA = "services.mqtt_bridge.media"
 
 # -- incoming: motion, stops and lights

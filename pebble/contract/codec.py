@@ -103,15 +103,6 @@ def plain(channel: Channel, raw: bytes) -> Any:
         raise PayloadError(f"{channel.metric}: not JSON: {error}") from None
 
 
-def json_object(raw: bytes) -> dict[str, Any] | None:
-    """Return the JSON object in ``raw``; None if there is none."""
-    try:
-        value = _decoder.decode(raw)
-    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError):
-        return None
-    return value if isinstance(value, dict) else None
-
-
 def trim(raw: bytes) -> bytes:
     """Return the JSON in ``raw``: without a byte order mark, white space around it, or anything after a NUL.
 

@@ -3,12 +3,12 @@
 import json
 import re
 from collections.abc import Iterable
-from enum import StrEnum
 from functools import lru_cache
 from unicodedata import normalize
 
 from msgspec import Struct
 
+from pebble.contract.channels import INCOMING, OUTGOING
 from pebble.errors import ConfigError, PebbleError
 
 # ``/ + # $`` belong to MQTT; brokers close the connection on control characters and Unicode non-characters.
@@ -23,16 +23,6 @@ SERVERS, GATEWAYS = "servers", "gateways"
 _REMEMBERED, _REMEMBERED_LENGTH = 1024, 128  # topics, and characters of each: 1.5 MB at most
 
 _valid_level = re.compile(LEVEL).search
-
-
-class Direction(StrEnum):
-    """The direction of a topic as seen from the component, which subscribes to one kind and publishes the other."""
-
-    INCOMING = "incoming"
-    OUTGOING = "outgoing"
-
-
-_DIRECTIONS = {str(direction): direction for direction in Direction}
 
 
 class Identity(Struct, frozen=True):
@@ -67,20 +57,16 @@ class Identity(Struct, frozen=True):
         """True for an operators' server or a gateway: it does not drive, and is not listed with robots."""
         return self.type in (SERVERS, GATEWAYS)
 
-    def incoming(self, metric: str) -> str:
-        """Return a topic that this component subscribes to; ``metric`` may have several levels."""
-        return f"{self.base}/{Direction.INCOMING}/{metric}"
-
     def outgoing(self, metric: str) -> str:
         """Return a topic that this component publishes; ``metric`` may have several levels."""
-        return f"{self.base}/{Direction.OUTGOING}/{metric}"
+        return f"{self.base}/{OUTGOING}/{metric}"
 
 
 class ParsedTopic(Struct, frozen=True):
     """The parts of a topic of the contract: identity, direction and metric (one or more levels)."""
 
     identity: Identity
-    direction: Direction
+    direction: str  # INCOMING or OUTGOING, as seen from the component
     metric: str
 
     @property
@@ -119,12 +105,12 @@ def parse_topic(topic: str) -> ParsedTopic | None:
 
 def _parse(topic: str) -> ParsedTopic | None:
     levels = topic.split("/", 4)
-    if len(levels) < 5 or levels[3] not in _DIRECTIONS or not levels[4]:
+    if len(levels) < 5 or levels[3] not in (INCOMING, OUTGOING) or not levels[4]:
         return None
     system, type_, id_, direction, metric = levels
     if not (_valid_level(system) and _valid_level(type_) and _valid_level(id_)):
         return None
-    return ParsedTopic(Identity(system, type_, id_), _DIRECTIONS[direction], metric)
+    return ParsedTopic(Identity(system, type_, id_), direction, metric)
 
 
 _remembered = lru_cache(_REMEMBERED)(_parse)

@@ -8,10 +8,7 @@ from typing import Final
 
 from msgspec import Struct
 
-from pebble.contract import codec
-from pebble.contract.channels import LINK
-from pebble.contract.payloads import LinkLevel, LinkState
-from pebble.errors import PayloadError
+from pebble.contract.payloads import LinkLevel
 
 INTERVAL_S: Final = 1.0  # assumed between heartbeats: most robots send four a second
 
@@ -57,11 +54,3 @@ def silent_after(interval_s: float = INTERVAL_S, link: LinkLevel = "wide", late_
     robot has published, if known.
     """
     return max(2 * interval_s, 4 * late_s, LEVELS[link].silent_s)
-
-
-def link_of(payload: bytes) -> LinkState | None:
-    """Return the state in a message on ``outgoing/link``; None if it was removed, or cannot be read."""
-    try:
-        return codec.decode(LINK, payload) if payload else None
-    except PayloadError:
-        return None

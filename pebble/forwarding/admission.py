@@ -27,9 +27,6 @@ class Admission:
         self._second = 0  # the present one, whose messages are counted
         self._counts: dict[tuple[Kind | Channel, bool], int] = {}  # of this second, with a name and without one
 
-    def __len__(self) -> int:
-        return len(self._flags)
-
     def refuse(self, side: Side, subject: Subject, message: Message, topic: str, *, named: bool = True) -> Drop | None:
         """Return why this message may not pass to ``topic``; None if it may. Must be fast.
 

@@ -23,18 +23,11 @@ class _Event(Struct, eq=False):
 class EventBuffer:
     """A buffer that sends events in order; during an outage they wait, and the oldest is dropped when it is full."""
 
-    def __init__(
-        self,
-        transport: Transport,
-        counters: Counters,
-        *,
-        clock: Callable[[], float],
-        limit: int = LIMIT,
-    ) -> None:
-        self._transport, self._counters, self._clock, self._limit = transport, counters, clock, limit
+    def __init__(self, transport: Transport, counters: Counters, *, clock: Callable[[], float]) -> None:
+        self._transport, self._counters, self._clock = transport, counters, clock
         self._lock = threading.Lock()
         self._waiting: deque[_Event] = deque()
-        self._recent: deque[_Event] = deque(maxlen=limit)  # sent on this connection, which may have lost the last ones
+        self._recent: deque[_Event] = deque(maxlen=LIMIT)  # sent on this connection, which may have lost the last ones
         self._lost_at: float | None = None  # when the connection was lost, until flush()
         #: True if a message may be sent now, where the link is thin; others wait.
         self.has_room: Callable[[Message], bool] | None = None
@@ -52,7 +45,7 @@ class EventBuffer:
         """Keep ``message`` until the next :meth:`resume` or :meth:`flush`."""
         with self._lock:
             self._waiting.append(_Event(message))
-            if len(self._waiting) > self._limit:
+            if len(self._waiting) > LIMIT:
                 self._waiting.popleft()
                 self._counters.add("events_dropped")
 
@@ -68,8 +61,8 @@ class EventBuffer:
             if self._lost_at is not None:
                 recent = [event for event in self._recent if 0 <= self._lost_at - event.sent_at <= RESEND_S]
                 waiting = recent + list(self._waiting)
-                self._counters.add("events_dropped", max(0, len(waiting) - self._limit))
-                self._waiting = deque(waiting[-self._limit :])
+                self._counters.add("events_dropped", max(0, len(waiting) - LIMIT))
+                self._waiting = deque(waiting[-LIMIT:])
                 self._lost_at = None
             self._recent.clear()
             self._drain()

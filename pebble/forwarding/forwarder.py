@@ -111,7 +111,7 @@ class Forwarder:
     ) -> None:
         self.counters, self._steps = Counters(), steps
         self.stays: Callable[[str], bool] = lambda _topic: False  # True for topics obeyed only inside the robot
-        self.subjects, self._rules, self._names, self._clock = subjects, rules, names, clock
+        self.subjects, self._rules, self._names = subjects, rules, names
         self._pass_stop = pass_stop
         self.sides = Sides(
             (side, SideState(side, transport, self.counters, clock, wins=side is winner))

@@ -17,29 +17,25 @@ class LoopbackFilter:
     def __init__(self, clock: Callable[[], float], expiry_s: float = EXPIRY_S) -> None:
         self._clock, self._expiry_s = clock, expiry_s
         self._lock = threading.Lock()
-        self._out: dict[str, deque[tuple[float, bytes]]] = {}  # by topic: when each was published, and its digest
+        self.out: dict[str, deque[tuple[float, bytes]]] = {}  # by topic: when each was published, and its digest
         self._messages = 0  # of all topics
-
-    def __len__(self) -> int:
-        """Return the number of topics with messages that have not come back yet."""
-        return len(self._out)
 
     def expect(self, topic: str, payload: bytes) -> None:
         """Expect a message to come back. Call this before publishing: the echo may be faster than a call after it."""
         with self._lock:
-            out = self._out.setdefault(topic, deque())
+            out = self.out.setdefault(topic, deque())
             out.append((self._clock(), _digest(payload)))
             self._messages += 1
             if len(out) > LIMIT:
                 self._drop_first(out)
-            while len(self._out) > TOPICS or self._messages > MESSAGES:
-                self._messages -= len(self._out.pop(next(iter(self._out))))
+            while len(self.out) > TOPICS or self._messages > MESSAGES:
+                self._messages -= len(self.out.pop(next(iter(self.out))))
 
     def forget(self, topic: str) -> None:
         """Forget the newest message on ``topic``, which could not be sent."""
         with self._lock:
-            if self._out.get(topic):
-                self._out[topic].pop()
+            if self.out.get(topic):
+                self.out[topic].pop()
                 self._messages -= 1
                 self._tidy(topic)
 
@@ -49,7 +45,7 @@ class LoopbackFilter:
         A broker keeps the order of a topic, so the earlier ones will not come back.
         """
         with self._lock:
-            out = self._out.get(topic)
+            out = self.out.get(topic)
             if not out:
                 return False
             while out and self._clock() - out[0][0] > self._expiry_s:
@@ -65,8 +61,8 @@ class LoopbackFilter:
             return False
 
     def _tidy(self, topic: str) -> None:
-        if not self._out[topic]:
-            del self._out[topic]
+        if not self.out[topic]:
+            del self.out[topic]
 
     def _drop_first(self, out: deque[tuple[float, bytes]]) -> None:
         out.popleft()

@@ -6,7 +6,7 @@ Both are called on the threads that receive messages, and must not wait. No step
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Final, TypeAlias
+from typing import Any, Concatenate, Final, ParamSpec, TypeAlias
 
 from pebble.config import Config
 from pebble.contract import Channel
@@ -18,6 +18,7 @@ from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.transports import Message
 
 _log = RateLimitedLog(logging.getLogger(__name__), period_s=60.0)
+_V = ParamSpec("_V")
 
 ROBOT: Final = "(robot)"  # a program of the robot: no account has such a name
 
@@ -53,7 +54,7 @@ class Observer:
         """Note a stop that is no longer repeated although a motor owner has not confirmed it."""
 
 
-class Observers(Observer):
+class Observers:
     """The observers of all extensions. An exception in one is logged, and the others are still called."""
 
     def __init__(self, config: Config, clock: Callable[[], float]) -> None:
@@ -63,31 +64,11 @@ class Observers(Observer):
                 with logged(extension.name):
                     self._observers.append(part(extension.observer)(config, clock))
 
-    def start(self) -> None:
-        self._tell("start")
-
-    def close(self) -> None:
-        self._tell("close")
-
-    def passed(self, channel: Channel, by: str | None, payload: bytes) -> None:
-        self._tell("passed", channel, by, payload)
-
-    def refused(self, drop: Drop, channel: Channel | None, by: str | None) -> None:
-        self._tell("refused", drop, channel, by)
-
-    def control(self, state: ControlState) -> None:
-        self._tell("control", state)
-
-    def estop(self, owner: str, state: EstopState) -> None:
-        self._tell("estop", owner, state)
-
-    def unconfirmed(self, owner: str, stop: EstopCommand) -> None:
-        self._tell("unconfirmed", owner, stop)
-
-    def _tell(self, method: str, *values: object) -> None:
+    def tell(self, method: Callable[Concatenate[Any, _V], None], *values: _V.args, **named: _V.kwargs) -> None:
+        """Call a method of each observer: ``tell(Observer.control, state)``."""
         for observer in self._observers:
             with logged(type(observer).__name__):
-                getattr(observer, method)(*values)
+                getattr(observer, method.__name__)(*values, **named)
 
 
 def steps_of(config: Config) -> dict[str, Step]:

@@ -7,8 +7,6 @@ from collections.abc import Iterable, Mapping
 from functools import partial
 from typing import Any, ClassVar
 
-from msgspec import Struct
-
 from pebble.contract import BRIDGE_PROBE, INCOMING, OUTGOING
 from pebble.forwarding.cycles import PROBE_PERIOD_S
 from pebble.forwarding.forwarder import Forwarder
@@ -23,17 +21,6 @@ from pebble.transports import Message, State, Subscription, Transport
 
 CHECK_AGAIN_S = 30.0  # while nothing is forwarded
 CHECK_SOON_S = 1.0  # after the first sign that two sides are one: it may have been a copy
-
-
-class Status(Struct, frozen=True):
-    """The state of a forwarding service, for tools and tests."""
-
-    gate: Gate
-    mirroring: bool  # by the flag remote-mirror, which does not concern the service mqtt_mirror
-    synchronized: frozenset[Side]  # whose retained messages have arrived
-    epoch: int  # grows whenever the remote side is not connected
-    subscribed: frozenset[Side]
-    counts: dict[str, int]  # messages, by side and what became of them
 
 
 class ForwardingService(Service, ABC):
@@ -66,18 +53,6 @@ class ForwardingService(Service, ABC):
         )
         self.epoch = 0  # grows whenever the remote side is not connected: what carries an older one is dropped
         self.subscriptions: dict[Side, list[Subscription]] = {side: [] for side in Side}
-
-    @property
-    def status(self) -> Status:
-        forwarder = self.forwarder
-        return Status(
-            gate=forwarder.gate,
-            mirroring=forwarder.mirroring.on,
-            synchronized=frozenset(side for side in Side if forwarder.retained.synchronized(side)),
-            epoch=self.epoch,
-            subscribed=frozenset(side for side in Side if self.subscriptions[side]),
-            counts=forwarder.counters.snapshot(),
-        )
 
     # -- to implement
 

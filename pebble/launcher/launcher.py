@@ -92,7 +92,7 @@ class Launcher:
 
     def _start(self) -> None:
         """Start all programs, without waiting for any to be ready."""
-        self._reactor.watch(self._signals.descriptor, self._signals.drain)
+        self._reactor.watch(self._signals.wakeup.fileno(), self._signals.wakeup.clear)
         preload(shared_modules(self._config, [supervisor.program for supervisor in self._supervisors]))
         for supervisor in self._supervisors:
             if self._stop_requested():

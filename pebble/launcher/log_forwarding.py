@@ -60,7 +60,8 @@ class LogForwarder:
         for line in text.splitlines():
             self._stderr.write(f"{clock} [{level}] [{service}] {line}")
         if published and LEVELS.index(level) >= _LEAST:
-            message = cut(f"[{service}] {text}", _LONGEST)
+            whole = f"[{service}] {text}"
+            message = whole if len(whole) <= _LONGEST else whole[: _LONGEST - 3] + "..."
             now_ms = time.time_ns() // 1_000_000
             self._publish(LogRecord(t=now_ms, level=level, service=service, message=message, logger=logger, pid=pid))
 
@@ -144,8 +145,3 @@ def text_of(line: bytes) -> str:
 def _known(level: str) -> str | None:
     level = {"WARN": "WARNING", "FATAL": "CRITICAL"}.get(level, level)
     return level if level in LEVELS else None
-
-
-def cut(text: str, limit: int) -> str:
-    """Return at most ``limit`` characters; a longer text ends in three dots."""
-    return text if len(text) <= limit else text[: limit - 3] + "..."

@@ -4,6 +4,7 @@ import selectors
 import signal
 import time
 from collections.abc import Callable
+from math import inf
 from types import FrameType
 
 from pebble.runtime.timers import Timer, Timers
@@ -69,7 +70,7 @@ class Reactor:
                 now = self.now()
                 if end is not None and now >= end:
                     return False
-                self._turn(self._timers.wait(now), None if end is None else end - now)
+                self._turn(min(self._timers.next_due, inf if end is None else end) - now)
             return True
         finally:
             self._read_at = None
@@ -77,16 +78,16 @@ class Reactor:
     def close(self) -> None:
         self._selector.close()
 
-    def _turn(self, *waits: float | None) -> None:
+    def _turn(self, wait_s: float) -> None:
         """Run the jobs of readable descriptors, then timers: a timer that checks for life needs the newest signs."""
-        for key, _ in self._selector.select(min([_TURN_S, *(wait for wait in waits if wait is not None)])):
+        for key, _ in self._selector.select(max(0.0, min(_TURN_S, wait_s))):
             if key.fd in self._selector.get_map():  # an earlier job of this turn may have forgotten it
                 key.data()
         self._timers.run_due(self.now())
 
 
 class StopSignals:
-    """A counter of SIGTERM, SIGINT and SIGHUP from :meth:`install` on; ``descriptor`` is readable after each.
+    """A counter of SIGTERM, SIGINT and SIGHUP from :meth:`install` on; each sets ``wakeup``.
 
     From the second signal on, the handler calls ``on_repeat``, as the user no longer wants to wait. Main thread only.
     """
@@ -94,19 +95,11 @@ class StopSignals:
     def __init__(self, on_repeat: Callable[[], None]) -> None:
         self.received = 0
         self._on_repeat = on_repeat
-        self._wakeup = WakeupPipe()
-
-    @property
-    def descriptor(self) -> int:
-        return self._wakeup.fileno()
-
-    def drain(self) -> None:
-        """Make :attr:`descriptor` unreadable until the next signal."""
-        self._wakeup.clear()
+        self.wakeup = WakeupPipe()
 
     def install(self) -> None:
         """Handle the signals until the process ends, except ignored ones (nohup)."""
-        signal.set_wakeup_fd(self._wakeup.set_fileno, warn_on_full_buffer=False)
+        signal.set_wakeup_fd(self.wakeup.set_fileno, warn_on_full_buffer=False)
         for number in _SIGNALS:
             if signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, self._receive)

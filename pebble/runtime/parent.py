@@ -7,7 +7,6 @@ import re
 import signal
 import sys
 from collections.abc import Callable
-from typing import NamedTuple
 
 from pebble.config.secret_text import without_secrets
 from pebble.config.visible import shown
@@ -72,19 +71,6 @@ def end_with_parent(number: int | None = None) -> None:
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL if number is None else number)
 
 
-class ProgramRequest(NamedTuple):
-    """A request to run an on-demand program, which begins with ``encoding`` (empty: as configured), or to end it."""
-
-    on: bool
-    encoding: str = ""
-
-
-def earlier_requests() -> dict[str, ProgramRequest]:
-    """Return the requests of an earlier process of this program, by the requested program."""
-    words = (word.partition("=") for word in os.environ.get(WANTED, "").split())
-    return {name: ProgramRequest(on=True, encoding=encoding) for name, _, encoding in words}
-
-
 def requested_encoding() -> str | None:
     """Return the encoding in the request that started this program; None for the configured encoding."""
     return os.environ.get(ENCODING) or None
@@ -109,7 +95,7 @@ class Notifier:
     def alive(self) -> None:
         self._write(notes.Alive())
 
-    def request(self, program: str, request: ProgramRequest) -> bool:
+    def request(self, program: str, on: bool, encoding: str = "") -> bool:
         """Request or release an on-demand program.
 
         Only a program with ``may_request`` (pebble.launcher.programs) may. Its requests expire 5 s after it has ended.
@@ -117,7 +103,7 @@ class Notifier:
         if self._fd is None and not self._no_launcher_logged:
             self._no_launcher_logged = True
             log.info("there is no launcher to start %s", program)
-        return self._write(notes.Wanted(program, request.on, request.encoding))
+        return self._write(notes.Wanted(program, on, encoding))
 
     def hold(self, program: str, on: bool) -> bool:
         """End an on-demand program; with ``on`` False, or once this process ends, it may run. See :meth:`request`."""

@@ -40,11 +40,6 @@ class Timers:
             self._discard_cancelled()
         return heap[0][0] if heap else inf
 
-    def wait(self, now: float) -> float | None:
-        """Return seconds until the next timer is due; None without timers."""
-        due = self.next_due
-        return None if due == inf else max(0.0, due - now)
-
     def run_due(self, now: float) -> None:
         """Run the due timers. A periodic timer that is late skips the runs that it has missed."""
         self._discard_cancelled()

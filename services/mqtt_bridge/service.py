@@ -16,7 +16,7 @@ from pebble.errors import ConfigError, PayloadError
 from pebble.extension import part
 from pebble.forwarding.forwarder import Routed, barrier
 from pebble.forwarding.names import Names
-from pebble.forwarding.observer import ROBOT, Observers, Step, steps_of
+from pebble.forwarding.observer import ROBOT, Observer, Observers, Step, steps_of
 from pebble.forwarding.private_topics import PrivateTopics
 from pebble.forwarding.retained_window import INITIAL_SYNC_S
 from pebble.forwarding.routing import TABLE_A1, Drop, Side
@@ -158,8 +158,8 @@ class MqttBridge(ForwardingService):
         if self._stops is not None:
             self.on_stop(self._stops.close)
             self.timers.add(self.clock(), self._stops.check, period=_CHECK_STOPS_S)
-        self._observers.start()
-        self.on_stop(self._observers.close)
+        self._observers.tell(Observer.start)
+        self.on_stop(partial(self._observers.tell, Observer.close))
         if self._heartbeat is not None:
             interval = self.config.services.mqtt_bridge.heartbeat.interval_seconds
             self.timers.add(self.clock(), self._publish_heartbeat, period=interval)
@@ -319,7 +319,7 @@ class MqttBridge(ForwardingService):
         self._owners.check(self.clock())
         for owner, stop in self._passed_stops.give_up():
             self.log.error("an emergency stop is not confirmed by %s, which has withdrawn its own", owner)
-            self._observers.unconfirmed(owner, stop)
+            self._observers.tell(Observer.unconfirmed, owner, stop)
 
     @every(REPEAT_S)
     def _repeat_stops(self) -> None:
@@ -360,7 +360,7 @@ class MqttBridge(ForwardingService):
         with suppress(PayloadError):
             state: ControlState = codec.decode(c.CONTROL_STATE, payload)
             keys = frozenset([state.key.encode()]) - {b""}  # none if no client has control: no stamp is judged
-            self._observers.control(state)
+            self._observers.tell(Observer.control, state)
         self.forwarder.ages.keys = keys
 
     def _on_probe(self, message: Message) -> None:
@@ -392,7 +392,7 @@ class MqttBridge(ForwardingService):
             state = codec.decode(c.ESTOP_STATE, payload) if payload else None
             self._passed_stops.follow(owner, state)
             if state is not None:
-                self._observers.estop(owner, state)
+                self._observers.tell(Observer.estop, owner, state)
 
     def _has_passed(self, message: Message) -> bool:
         """True if the stops' own connection has passed this stop on already. Otherwise remembers it."""
@@ -416,7 +416,7 @@ class MqttBridge(ForwardingService):
         channel = routed.subject.channel if routed.subject is not None else None
         is_local = side is Side.LOCAL
         if not is_local and isinstance(routed.outcome, Drop):
-            self._observers.refused(routed.outcome, channel, routed.by)
+            self._observers.tell(Observer.refused, routed.outcome, channel, routed.by)
         if routed.outcome is Drop.STALE:
             self.refusals.stale("a command" if channel is None else channel.metric)
             return
@@ -427,7 +427,7 @@ class MqttBridge(ForwardingService):
         if not message.retain and routed.outcome is not Drop.KNOWN:  # observers see what is new, not what is known
             # With a closed gate both sides may be one broker, and the message an operator's.
             by_robot = is_local and self.forwarder.gate is Gate.OPEN
-            self._observers.passed(channel, ROBOT if by_robot else routed.by, message.payload)
+            self._observers.tell(Observer.passed, channel, ROBOT if by_robot else routed.by, message.payload)
         self._requests.message(channel, message.payload)
 
     def on_value(self, subject: Subject, payload: bytes) -> None:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from pebble import contract as c
 from pebble.contract import CHANNELS, INCOMING, OUTGOING, Channel, Kind, channel_of
-from pebble.contract.identity import Direction, Identity, ParsedTopic, parse_topic
+from pebble.contract.identity import Identity, ParsedTopic, parse_topic
 from pebble.contract.names import with_name, without_name
 from pebble.contract.payloads import Payload
 from pebble.errors import ConfigError
@@ -218,7 +218,7 @@ def test_every_transport_carries_an_accepted_identity(system: str, type_: str, i
     except ConfigError:
         return
     topic = check_topic(identity.outgoing("online"))
-    assert parse_topic(topic) == ParsedTopic(identity, Direction.OUTGOING, "online")
+    assert parse_topic(topic) == ParsedTopic(identity, OUTGOING, "online")
 
 
 # -- the sender's account in a topic

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 from pebble.config import config_of_process
-from pebble.runtime.parent import NOTIFY_FD, Notifier, ProgramRequest, earlier_requests
+from pebble.runtime.parent import NOTIFY_FD, WANTED, Notifier
 
 
 def note(event: str) -> None:
@@ -42,7 +42,7 @@ def ask(notify: Notifier) -> None:
     """
     orders = Path(f"{sys.argv[3]}.orders.{sys.argv[1]}")
     orders.write_text("")  # those of the previous process are old
-    note("before:" + ",".join(f"{name}={request.encoding}" for name, request in earlier_requests().items()))
+    note("before:" + ",".join(os.environ.get(WANTED, "").split()))
     note("ready")
     notify.ready()
     with orders.open() as lines:
@@ -54,7 +54,7 @@ def ask(notify: Notifier) -> None:
                 elif first == "hold":
                     notify.hold(rest[0], rest[1] == "1")
                 else:
-                    notify.request(first, ProgramRequest(rest[0] == "1", *rest[1:]))
+                    notify.request(first, rest[0] == "1", *rest[1:])
             notify.alive()
             time.sleep(0.01)
 

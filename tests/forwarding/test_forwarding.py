@@ -75,14 +75,14 @@ class TestLoopbackFilter:
         loopback = LoopbackFilter(Clock())
         for number in range(2 * loopback_filter.TOPICS):
             loopback.expect(f"flag{number}", b"1")
-        assert len(loopback) == loopback_filter.TOPICS
+        assert len(loopback.out) == loopback_filter.TOPICS
         assert all(
             loopback.is_echo(f"flag{number}", b"1")
             for number in range(loopback_filter.TOPICS, 2 * loopback_filter.TOPICS)
         )
         loopback.expect("t", b"1")
         loopback.forget("t")
-        assert len(loopback) == 0
+        assert not loopback.out
         for _ in range(loopback_filter.MESSAGES):  # what has come back does not count
             loopback.expect("t", b"1")
             assert loopback.is_echo("t", b"1")

@@ -131,7 +131,7 @@ class Running(NamedTuple):
 
     @property
     def gate(self) -> Gate:
-        return self.service.status.gate
+        return self.service.forwarder.gate
 
 
 class World:

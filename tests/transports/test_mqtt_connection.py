@@ -62,7 +62,7 @@ class Link:
         """The other end does; all of it is in our socket when this returns."""
         if whole := b"".join(data):
             self.other.sendall(whole)
-            select.select([self.connection.socket], [], [], 5)
+            select.select([self.connection.client.socket], [], [], 5)
 
     def pump(self, *, until_read: int = 1) -> None:
         """Go on until so many messages are read."""
@@ -249,9 +249,9 @@ def test_an_acknowledgement_is_complete_after_what_came_before_it_was_delivered(
     ack, seen = link.connection.subscribe([("a", False)]), list[bool]()
     link.sends(packet(0x90, b"\0\1\1"), sent(b"x", retain=True))
     while not seen:
-        link.connection.pump(1.0, lambda messages: seen.extend(ack.done for _ in messages))
+        link.connection.pump(1.0, lambda messages: seen.extend(ack.is_set() for _ in messages))
     assert seen == [False]
-    assert ack.done
+    assert ack.is_set()
 
 
 def test_a_discarded_connection_sends_nothing_more(link: Link) -> None:
@@ -290,7 +290,7 @@ def test_a_packet_has_eight_filters_at_most_and_what_was_asked_is_named_when_the
     for mid, count in enumerate(map(len, parts)):
         link.sends(packet(0x90, bytes((0, mid + 1)) + b"\1" * count), packet(0xB0, bytes((0, mid + 4))))
         link.connection.pump(1.0, link.messages.extend)
-        assert ack.done is (mid == 2)
+        assert ack.is_set() is (mid == 2)
     link.connection.subscribe([(name, False) for name in names])
     link.other.close()
     with pytest.raises(Lost, match="asked to deliver t/0, t/1, t/2 and 17 more"):
@@ -341,11 +341,11 @@ def test_how_long_an_answer_took_is_known(link: Link) -> None:
 
 
 def test_the_socket_keeps_little_while_the_way_is_slow(link: Link) -> None:
-    assert link.connection.socket is not None
+    assert link.connection.client.socket is not None
     sizes = []
     for slow in (False, True, False):
         link.connection.suit(thin=slow)
-        sizes.append(link.connection.socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT))
+        sizes.append(link.connection.client.socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT))
     assert sizes == [0, 4096, 0]
 
 

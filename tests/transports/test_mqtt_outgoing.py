@@ -22,7 +22,7 @@ from tests.support import THOROUGH, cases, some
 
 def drain(backlog: Backlog) -> list[bytes]:
     taken = []
-    while backlog:
+    while backlog.waiting:
         taken.append(backlog.take().payload)
     return taken
 
@@ -55,7 +55,7 @@ def test_a_delivered_message_makes_what_waits_on_its_topic_stale() -> None:
     assert backlog.supersede(Message("a", b"4")) == 1
     assert backlog.supersede(Message("a", b"5", retain=True)) == 1
     assert drain(backlog) == [b"2"]
-    assert not backlog
+    assert not backlog.waiting
 
 
 def retained(topic: str, payload: bytes = b"1", qos: QoS = QoS.DELIVERED) -> Message:
@@ -119,15 +119,15 @@ def test_answers_complete_their_request_only() -> None:
     in_flight.ping(0.0, ping)
     in_flight.answer(2)
     in_flight.answer(7)
-    assert not second.done, "not before what came before the answer has been delivered"
+    assert not second.is_set(), "not before what came before the answer has been delivered"
     in_flight.complete()
-    assert (first.done, second.done, ping.done) == (False, True, False)
+    assert (first.is_set(), second.is_set(), ping.is_set()) == (False, True, False)
     in_flight.pong(1.0)
     in_flight.complete()
-    assert ping.done
+    assert ping.is_set()
     in_flight.pong(1.0)  # one more than there were pings
     in_flight.end()
-    assert first.done
+    assert first.is_set()
 
 
 def test_a_topic_counts_as_accepted_once_the_ping_after_its_first_message_is_answered() -> None:

@@ -212,7 +212,7 @@ class TestRead:
         assert len(noted.seen) == 500
         asked = sum(qos for _, _, qos, _ in noted.seen)
         assert len(reader.acks) == 4 * asked > 400
-        assert reader.unread == reader.partial == 0
+        assert reader.unread == len(reader.partial) == 0
 
     def test_no_more_than_asked_for(self) -> None:
         reader = Reader(noted := Noted(), NO_QUOTA, modern=False)
@@ -277,7 +277,7 @@ class TestRead:
         noted, reader = read(long + after, modern=modern, pieces=pieces)
         assert noted.seen == [("too_long", b"a/b", MAX_PACKET + 7), (b"a", b"x", 0, False)]
         assert bytes(reader.acks) == qos * b"\x40\2\0\7"
-        assert reader.partial == 0
+        assert not reader.partial
 
     @both_versions
     @pytest.mark.parametrize(
@@ -311,7 +311,7 @@ class TestRead:
                         pass
             except MalformedError:
                 refused += 1
-            assert reader.partial <= MAX_PACKET
+            assert len(reader.partial) <= MAX_PACKET
         assert 500 < refused < 2000
 
 

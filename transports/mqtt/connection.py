@@ -82,7 +82,7 @@ class Connection:
         self.pings = self.incoming.pings
         self._poll = SocketPoll()
         bridge = as_published and opening.settings.protocol != "5"
-        self._client = client_class(opening, self.incoming, bridge=bridge)
+        self.client = client_class(opening, self.incoming, bridge=bridge)
 
     # -- opening and closing
 
@@ -93,7 +93,7 @@ class Connection:
         """
         dialled = time.monotonic()
         try:
-            self._client.open()
+            self.client.open()
         except (OSError, ValueError) as error:
             # Absent if nothing listens there, TlsLate if TLS takes too long, else Lost.
             ending = next((ending for kind, ending in _UNREACHED.items() if isinstance(error, kind)), Lost)
@@ -112,7 +112,7 @@ class Connection:
         except Refused:
             raise
         except Lost as lost:
-            if self._client.socket is None:  # the broker closed it
+            if self.client.socket is None:  # the broker closed it
                 raise Refused(f"{self.where} hung up on our CONNECT", Result.HUNG_UP) from None
             raise lost from None
         self.max_packet = accepted.max_packet
@@ -124,7 +124,7 @@ class Connection:
     def discard(self) -> None:
         """Reset the connection without DISCONNECT; all queued data is lost, in the kernel too."""
         with self._lock:
-            sock = self._client.socket
+            sock = self.client.socket
             if sock is not None:
                 with suppress(OSError):  # it may be closed already
                     sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _ABORT)
@@ -135,7 +135,7 @@ class Connection:
     def disconnect(self) -> None:
         """Send DISCONNECT, which makes the broker discard our will."""
         with self._lock:
-            self._client.disconnect()
+            self.client.disconnect()
 
     def wake(self) -> None:
         """Make `pump` return; other threads call it."""
@@ -144,7 +144,7 @@ class Connection:
     def suit(self, *, thin: bool) -> None:
         """Adapt to a thin link to the broker, or to a wide one; see `Transport.is_thin`."""
         with self._lock:
-            sock = self._client.socket
+            sock = self.client.socket
             if sock is not None and thin is not self.pings.is_thin:
                 keep_unsent(sock, _UNSENT if thin else _BY_SYSTEM)
             self.pings.is_thin = thin
@@ -158,7 +158,7 @@ class Connection:
         is completed: no retained message is delivered after the confirmation of its subscription.
         """
         readable, now = self._wait(timeout)
-        client, incoming = self._client, self.incoming
+        client, incoming = self.client, self.incoming
         with self._lock:
             # Before reading: messages queued during a silence must not arrive as if they were fresh (T19).
             if now - incoming.answered_at > incoming.silence_s:
@@ -199,11 +199,11 @@ class Connection:
         """
         if not self._poll.registered:
             with self._lock:
-                if self._client.socket is not None:
-                    self._poll.register(self._client.socket)
-        if self._client.socket is None:
+                if self.client.socket is not None:
+                    self._poll.register(self.client.socket)
+        if self.client.socket is None:
             raise self.incoming.lost
-        blocked, waiting = bool(self._client.waiting), self.incoming.age.waiting
+        blocked, waiting = bool(self.client.waiting), self.incoming.age.waiting
         began = now = clock.since_boot()
         wait_s = min(timeout, self.pings.due_at - began)
         ready = NOTHING
@@ -224,8 +224,8 @@ class Connection:
         return readable, now
 
     def _write(self) -> None:
-        self._client.write()
-        while self._backlog.waiting and self._client.socket is not None and not self._client.waiting:
+        self.client.write()
+        while self._backlog.waiting and self.client.socket is not None and not self.client.waiting:
             self._write_publish(self._backlog.take(), None)
 
     def _quick_ack(self) -> None:
@@ -234,7 +234,7 @@ class Connection:
         The kernel falls back to delayed ACKs whenever we send, so this is called after every read, unless MQTT's own
         acknowledgements follow and carry TCP's. On a thin link TCP's next ACK waits for MQTT's, see `_ONCE`.
         """
-        sock = self._client.socket
+        sock = self.client.socket
         if _QUICKACK is not None and sock is not None:
             try:  # noqa: SIM105  (hot)
                 sock.setsockopt(socket.IPPROTO_TCP, _QUICKACK, _ONCE if self.pings.is_thin else 1)
@@ -247,13 +247,13 @@ class Connection:
         """Send a ping, whose answer proves that the broker has processed everything sent before."""
         ack = PendingAck()
         with self._lock:
-            self.pings.send(self._client, ack)
+            self.pings.send(self.client, ack)
         return ack
 
     def publish(self, message: Message, *, expires_s: int | None = None) -> bool:
         """Send a message; False if that is impossible. A message of QoS 0 may wait, and be dropped for a newer one."""
         with self._lock:
-            client, limits = self._client, self.limits
+            client, limits = self.client, self.limits
             if client.socket is None:
                 return False
             if message.qos is QoS.DELIVERED and self.in_flight.unacked >= UNACKED_LIMIT and self._is_full(message):
@@ -288,7 +288,7 @@ class Connection:
     def _write_publish(self, message: Message, expires_s: int | None) -> None:
         if self.limits is not EVERYTHING:
             message = self.limits.fit(message)
-        mid = self._client.publish(
+        mid = self.client.publish(
             message.topic, message.payload, int(message.qos), retain=message.retain, expires_s=expires_s
         )
         self.in_flight.sent(message, mid, clock.since_boot())
@@ -299,10 +299,10 @@ class Connection:
         wanted = [
             Filter(text, most, no_local, self.incoming.as_published, sends_retained) for text, no_local in filters
         ]
-        return self._request(self._client.subscribe, wanted, [filter_.text for filter_ in wanted])
+        return self._request(self.client.subscribe, wanted, [filter_.text for filter_ in wanted])
 
     def unsubscribe(self, filters: list[str]) -> PendingAck:
-        return self._request(self._client.unsubscribe, filters, [])
+        return self._request(self.client.unsubscribe, filters, [])
 
     def _request(self, send: Callable[[Sequence[T]], int], filters: Sequence[T], asked: Sequence[str]) -> PendingAck:
         """Send a few filters in each packet; return the pending answer to the last packet.
@@ -312,11 +312,11 @@ class Connection:
         ack = PendingAck()  # of no packet: if none can be sent, it is completed at once
         with self._lock:
             for at in range(0, len(filters), FILTERS):
-                if self._client.socket is not None:
+                if self.client.socket is not None:
                     ack = PendingAck()  # of this packet
                     self.in_flight.ask(send(filters[at : at + FILTERS]), ack, asked[at : at + FILTERS])
-            if not filters or self._client.socket is None:
-                ack.complete()
+            if not filters or self.client.socket is None:
+                ack.set()
         self.wake()
         return ack
 
@@ -328,11 +328,6 @@ class Connection:
         return self.incoming.where
 
     @property
-    def socket(self) -> socket.socket | None:
-        """The socket; None once the connection is lost."""
-        return self._client.socket
-
-    @property
     def has_room(self) -> bool:
         return self.in_flight.unacked < UNACKED_LIMIT // 2
 
@@ -340,15 +335,15 @@ class Connection:
     def drained(self) -> bool:
         """True if all accepted messages are written, and acknowledged if they have QoS 1."""
         with self._lock:
-            return not (self.in_flight.unacked or self._backlog.waiting or self._client.waiting)
+            return not (self.in_flight.unacked or self._backlog.waiting or self.client.waiting)
 
     @property
     def outgoing(self) -> Outgoing:
         with self._lock:
-            sock = self._client.socket
+            sock = self.client.socket
             if sock is None:
                 return Outgoing()
-            waiting = self._backlog.size + self._client.unwritten + unconfirmed_bytes(sock)
+            waiting = self._backlog.size + self.client.unwritten + unconfirmed_bytes(sock)
             round_trip_s, since = shortest_round_trip_s(sock), self.in_flight.waiting_since
             # The longer round trip, as TCP's may end at a proxy; and twice that, as a broker without TCP_NODELAY holds
             # an answer back until the one before it is acknowledged.
@@ -360,7 +355,7 @@ class Connection:
     def answer(self) -> Answer | None:
         """The newest answer to a ping; None before the first one, and without a socket."""
         with self._lock:
-            sock = self._client.socket
+            sock = self.client.socket
             if sock is None:
                 return None
             number, seconds = self.in_flight.newest_answer(clock.since_boot())
@@ -378,6 +373,6 @@ class Connection:
         """Return by topic the size of a message that may be why the broker hung up; None if no message can be."""
         with self._lock:
             incoming = self.incoming
-            if not (incoming.may_concern_message or (self._client.hung_up and not incoming.reason)):
+            if not (incoming.may_concern_message or (self.client.hung_up and not incoming.reason)):
                 return None
             return self.in_flight.first_written(clock.since_boot())

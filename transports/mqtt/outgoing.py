@@ -51,16 +51,10 @@ class Backlog:
         self._live_bytes = 0  # of the messages that are not retained,
         self._live = 0  # and how many these are
 
-    def __bool__(self) -> bool:
-        return bool(self.waiting)
-
     @property
     def size(self) -> int:
         """Bytes of all payloads that wait."""
         return sum(len(message.payload) for message in self.waiting.values())
-
-    def __contains__(self, topic: str) -> bool:
-        return topic in self.waiting
 
     def put(self, message: Message) -> int:
         """Append ``message``; return how many messages were dropped to make room."""
@@ -100,21 +94,8 @@ class Backlog:
         return message
 
 
-class PendingAck:
+class PendingAck(threading.Event):
     """A pending answer of the broker. The loss of the connection completes it, too."""
-
-    def __init__(self) -> None:
-        self._answered = threading.Event()
-
-    @property
-    def done(self) -> bool:
-        return self._answered.is_set()
-
-    def wait(self, timeout: float) -> bool:
-        return self._answered.wait(timeout)
-
-    def complete(self) -> None:
-        self._answered.set()
 
 
 class _Unconfirmed(Struct):
@@ -241,7 +222,7 @@ class InFlightTable:
         """Complete the answered requests. Call this after delivering the messages received before the answers."""
         answered, self.answered = self.answered, []
         for ack in answered:
-            ack.complete()
+            ack.set()
 
     def ping(self, now: float, ack: PendingAck | None) -> None:
         """Track a PINGREQ."""
@@ -285,10 +266,10 @@ class InFlightTable:
         self.lost_bytes = max((size for _, size in unanswered.values()), default=0)
         self.complete()
         for ack, _ in self._requests.values():
-            ack.complete()
+            ack.set()
         for ping in self._pings:
             if ping.ack is not None:
-                ping.ack.complete()
+                ping.ack.set()
         self._requests.clear()
         self._pings.clear()
 

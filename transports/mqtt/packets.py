@@ -210,7 +210,7 @@ class Reader:
         self.acks = bytearray()
         self._listener, self._quota, self._modern = listener, quota, modern
         self._data, self._at = b"", 0  # received bytes, and where those begin that are not read yet
-        self._partial = bytearray()  # a packet that is not whole
+        self.partial = bytearray()  # a packet that is not whole
         self._needed = 0  # how many bytes it must have before `read` goes on
         self._discarded = 0  # bytes of a long packet that still come
         self._too_long = (b"", 0, b"")  # its topic, its length, and the answer to it
@@ -220,21 +220,16 @@ class Reader:
         """Number of bytes that wait for the next `read`: whole packets, and the beginning of another."""
         return len(self._data) - self._at
 
-    @property
-    def partial(self) -> int:
-        """Bytes of an incomplete packet."""
-        return len(self._partial)
-
     def feed(self, data: bytes) -> None:
         """Give received bytes to the parser, when nothing is `unread`."""
         if self._discarded:
             data = self._discard(data)
-        if self._partial:
-            self._partial += data
-            if len(self._partial) < self._needed:
+        if self.partial:
+            self.partial += data
+            if len(self.partial) < self._needed:
                 return
-            data = bytes(self._partial)
-            self._partial.clear()
+            data = bytes(self.partial)
+            self.partial.clear()
         self._data, self._at = data, 0
 
     def read(self, most: int) -> int:
@@ -278,7 +273,7 @@ class Reader:
 
     def _keep(self, size: int) -> None:
         """Keep the beginning of a packet until it has ``size`` bytes."""
-        self._partial += self._data[self._at :]
+        self.partial += self._data[self._at :]
         self._needed = size
         self._data, self._at = b"", 0
 

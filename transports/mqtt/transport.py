@@ -71,11 +71,6 @@ class MqttTransport(Transport):
         self._logged = ("", 0.0)  # the newest problem in the log, and when it went there
 
     @property
-    def not_taken(self) -> Mapping[str, tuple[str, float]]:
-        """Topics that the broker does not accept: why, and when that was last logged."""
-        return self._refused.not_taken
-
-    @property
     def untried(self) -> bool:
         return self._dialler.addresses.untried
 
@@ -359,7 +354,7 @@ class MqttTransport(Transport):
     ) -> None:
         """Run the connection until ``ack`` is done; ``receive`` gets the messages. Raises Lost, also when closing."""
         asked_at = clock.since_boot()
-        while not ack.done:
+        while not ack.is_set():
             if stopping.is_set():
                 raise Lost("closed")
             # The wait begins again while retained messages arrive, and on a thin link with every sign of life.
@@ -402,7 +397,7 @@ class MqttTransport(Transport):
             connection.publish(will)
         last = connection.ping()
         deadline = time.monotonic() + _CLOSING_S
-        while time.monotonic() < deadline and not (last.done and connection.drained):
+        while time.monotonic() < deadline and not (last.is_set() and connection.drained):
             connection.pump(deadline - time.monotonic(), ignore)
         connection.disconnect()
 

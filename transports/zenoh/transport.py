@@ -60,15 +60,11 @@ class ZenohTransport(Transport):
         self._siblings = PeerRegistry(self.settings.run_dir)
         self._barrier: Barrier | None = None  # of the newest session
         self._presence: PresenceLock | None = None
-        self._session: zenoh.Session | None = None
+        self.session: zenoh.Session | None = None
         self._publishers.declared.clear()
         self._loopback = LoopbackQueue(self.counters)
         self._opened = threading.Event()  # set after the first wait for siblings
         self._thread: threading.Thread | None = None
-
-    @property
-    def session(self) -> zenoh.Session | None:
-        return self._session
 
     # -- opening and closing
 
@@ -120,7 +116,7 @@ class ZenohTransport(Transport):
             if self._hub.watch.closed:
                 sessions.close_session(session)
                 return False
-            self._hub.name, self._session = name, session
+            self._hub.name, self.session = name, session
             self._publishers.declared.clear()
         self._barrier = Barrier(session, name, lambda: self._hub.retained_count, by_name=self._elsewhere)
         with self._connecting:
@@ -132,7 +128,7 @@ class ZenohTransport(Transport):
     def _close(self, will: Message | None) -> None:
         self._hub.watch.close()
         with self._hub.lock:
-            session = self._session
+            session = self.session
         if session is not None and self._pid == os.getpid():  # a fork cannot use the session
             self._publish_will_and_leave(session, will)
         if self._thread is not None and self._thread is not threading.current_thread():
@@ -142,7 +138,7 @@ class ZenohTransport(Transport):
             self._presence.release()
         self._subscribers.clear()
         self._publishers.declared.clear()
-        self._session = None
+        self.session = None
 
     def _publish_will_and_leave(self, session: zenoh.Session, will: Message | None) -> None:
         try:
@@ -216,7 +212,7 @@ class ZenohTransport(Transport):
 
     def _connect_hub(self) -> bool:
         """Send our will and missing messages to the hub, and ask for its retained messages."""
-        session = self._session
+        session = self.session
         self._set_state(State.CONNECTING)
         if session is None or not self._send_hello(session):
             self.problem = f"the hub of {self.settings.run_dir} does not answer"
@@ -255,20 +251,20 @@ class ZenohTransport(Transport):
     def _refresh(self) -> None:
         """Ask for all retained messages, as on a new connection, because connections were interrupted."""
         with self._connecting:
-            if self._session is None:
+            if self.session is None:
                 return
             with self._hub.lock:
                 self._hub.renew()  # answers to earlier queries are dropped
                 self._renew()  # all subscriptions: retained messages are delivered again
             counts = self._synchronize(SYNC_S)  # after _renew: messages received live meanwhile are newer
-            self._hub.fetch(self._session, list(self._subscribers), counts)
+            self._hub.fetch(self.session, list(self._subscribers), counts)
 
     # -- sending
 
     def _send(self, message: Message, urgent: bool) -> bool:
         if self._pid != os.getpid():
             sessions.check_process(self._pid)
-        session = self._session
+        session = self.session
         if session is None or (self.settings.client and not self._hub.watch.hubs):
             return False
         try:
@@ -293,7 +289,7 @@ class ZenohTransport(Transport):
     def _declare_all(self, subscriptions: Sequence[Subscription]) -> None:
         sessions.check_process(self._pid)
         with self._connecting:
-            session = self._session
+            session = self.session
             if session is None:
                 return  # they are declared when there is a session
             with contextlib.suppress(zenoh.ZError):  # closed meanwhile: then nothing is received any more

@@ -26,20 +26,16 @@ def check_doors(notes: Notes, root: Root) -> None:
 
 def warning_of_open(root: Root) -> str:
     """Return a warning if the level is ``open`` and other machines reach the robot, or ""."""
-    hosts = [f"broker {mqtt.host}" for _, mqtt in _robots_brokers(root) if not is_loopback(mqtt.host)]
+    hosts = [f"broker {mqtt.host}" for _, mqtt in brokers(core_connections(root)) if not is_loopback(mqtt.host)]
     places = [*hosts, *(endpoint for _, endpoint in _endpoints(root))]
     if root.security.level != "open" or not places:
         return ""
     return f'security.level is "open": whoever may publish by {places[0]} drives this robot (docs/ext/fleet.md)'
 
 
-def _robots_brokers(root: Root) -> Iterator[tuple[Path, Mqtt]]:
-    return ((path, section) for path, section in core_connections(root) if isinstance(section, Mqtt))
-
-
 def _check_links(notes: Notes, root: Root) -> None:
     level = root.security.level
-    for path, mqtt in brokers(root):
+    for path, mqtt in brokers(connections(root)):
         if is_loopback(mqtt.host):
             continue
         if not mqtt.tls.enabled and root.robot.platform != "esp8266":  # which has no memory for it
@@ -86,7 +82,7 @@ def _check_sides(notes: Notes, root: Root) -> None:
         notes.problem(("services", "mqtt_bridge", "enabled"), f"must be true: {why}")
     for path, _ in renamed_commands(root):
         notes.problem(path, f"cannot be renamed: {why}, by the contract's topics")
-    for path, mqtt in _robots_brokers(root):
+    for path, mqtt in brokers(core_connections(root)):
         if path[-1] != "remote_mqtt" and not is_loopback(mqtt.host):  # of the robot's own programs
             notes.problem((*path, "host"), f"must be on loopback: {why}, which are not checked at {mqtt.host}")
     for path, endpoint in _endpoints(root):

@@ -2,7 +2,7 @@
 
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path as FilePath
 
 from pebble.config.hosts import is_loopback
@@ -26,7 +26,7 @@ def warn_if_readable(notes: Notes, path: Path, file: FilePath, what: str) -> Non
 
 def warn_of_logins_in_clear(notes: Notes, root: Root) -> None:
     """Warn of each broker on the network that receives a user name and a password without encryption."""
-    for path, mqtt in brokers(root):
+    for path, mqtt in brokers(connections(root)):
         if mqtt.username is not None and not mqtt.tls.enabled and not is_loopback(mqtt.host):
             fix = "set tls.enabled"
             if root.robot.platform == "esp8266":
@@ -43,9 +43,9 @@ def warn_of_known_id(notes: Notes, root: Root) -> None:
         notes.warning(path, f"{risk}: leave it out, unless the broker lets only this account use it")
 
 
-def brokers(root: Root) -> Iterator[tuple[Path, Mqtt]]:
-    """Yield the brokers that the robot's programs connect to, with their places in the config."""
-    return ((path, section) for path, section in connections(root) if isinstance(section, Mqtt))
+def brokers(connections: Iterable[tuple[Path, Section]]) -> Iterator[tuple[Path, Mqtt]]:
+    """Yield the brokers among ``connections`` of the robot's programs, with their places in the config."""
+    return ((path, section) for path, section in connections if isinstance(section, Mqtt))
 
 
 def connections(root: Root) -> Iterator[tuple[Path, Section]]:

@@ -141,7 +141,7 @@ def operator_page(config: Config) -> Iterator[CheckResult]:
 def brokers(config: Config) -> Iterator[CheckResult]:
     """Check each broker that the robot uses: its login, its rights, and on which other addresses it answers."""
     level, link = config.security.level, config.services.mqtt_bridge.link
-    sections = {str(path[-1]): mqtt for path, mqtt in exposure.brokers(config)}
+    sections = {str(path[-1]): mqtt for path, mqtt in exposure.brokers(exposure.connections(config))}
     for section, name in _BROKERS.items():
         if (mqtt := sections.get(section)) is None:
             continue

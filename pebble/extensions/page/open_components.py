@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 from msgspec.structs import replace
 
 from pebble import contract as c
-from pebble.contract import codec
-from pebble.contract.identity import Direction
+from pebble.contract import OUTGOING, codec
 from pebble.contract.payloads import AnyObject
 from pebble.errors import PayloadError, PebbleError
 from pebble.extensions.operator.client.broker import Broker
@@ -43,7 +42,7 @@ _Filters = dict[str, _Meaning | None]
 _NAMED = [
     channel
     for channel in PLACES
-    if channel.direction == Direction.OUTGOING and channel.payload is not bytes and channel is not c.VIDEO_OVERLAYS
+    if channel.direction == OUTGOING and channel.payload is not bytes and channel is not c.VIDEO_OVERLAYS
 ]
 #: Fields of FlagsView.
 _FLAG_FIELDS = {flag: flag.metric.removeprefix("flags/").replace("-", "_") for flag in FLAGS.values()}
@@ -180,7 +179,7 @@ class OpenComponents:
             self._add(filters, ref, channel)
         for metric in self._robots.aliases(ref):
             alias = c.Channel(metric=metric, kind=c.Kind.STREAM, payload=AnyObject)
-            filters.setdefault(f"{ref}/{Direction.OUTGOING}/{metric}", _Meaning(ref, alias))
+            filters.setdefault(f"{ref}/{OUTGOING}/{metric}", _Meaning(ref, alias))
         for flag in FLAGS.values():
             filters[self._robots.topic(ref, flag)] = _Meaning(ref, flag)
         source = self._robots.sources.get(ref, ref)

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import msgspec
 
 from pebble import contract as c
-from pebble.contract import channel_of, codec, is_reserved
-from pebble.contract.identity import LEVEL, Direction, parse_topic
+from pebble.contract import OUTGOING, channel_of, codec, is_reserved
+from pebble.contract.identity import LEVEL, parse_topic
 from pebble.errors import PayloadError
 from pebble.extensions.operator.client.robot_topics import FLEET, topic_of
 from pebble.extensions.operator.client.robot_view import RobotView
@@ -209,7 +209,7 @@ class Robots:
     def receive(self, message: Message, now: float) -> None:
         """Handle a message of any component."""
         address = parse_topic(message.topic)
-        if address is None or address.direction is not Direction.OUTGOING or address.identity.is_server:
+        if address is None or address.direction != OUTGOING or address.identity.is_server:
             return
         self.receive_as(address.identity.base, address.metric, message, now)
 
@@ -381,7 +381,7 @@ class Robots:
 
 
 def _channel(metric: str) -> c.Channel | None:
-    return channel_of(f"{Direction.OUTGOING}/{metric}")
+    return channel_of(f"{OUTGOING}/{metric}")
 
 
 def _aliases(payload: bytes) -> tuple[str, ...]:

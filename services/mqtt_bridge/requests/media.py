@@ -1,16 +1,24 @@
 """Requests for media programs: a flag set by operators permits them, a request starts and stops them."""
 
+import os
 from collections.abc import Callable, Collection, Mapping
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, NamedTuple
 
 from msgspec import Struct
 
 from pebble.contract import AUDIO_CONTROL, MQTT_AUDIO, MQTT_VIDEO, VIDEO_CONTROL, Channel, Kind
 from pebble.contract.encodings import ALL_SOUND, ALL_VIDEO
 from pebble.contract.payloads import MediaRequest
-from pebble.runtime.parent import Notifier, ProgramRequest, earlier_requests
+from pebble.runtime.parent import WANTED, Notifier
 from pebble.runtime.service import Service
 from pebble.services.mqtt_bridge.own_requests import Requests
+
+
+class ProgramRequest(NamedTuple):
+    """A request to run an on-demand program, which begins with ``encoding`` (empty: as configured), or to end it."""
+
+    on: bool
+    encoding: str = ""
 
 
 class Row(Struct, frozen=True, eq=False):
@@ -78,6 +86,12 @@ class Media:
                 self._sent[program] = request
 
 
+def earlier_requests() -> dict[str, ProgramRequest]:
+    """Return the requests of an earlier process of this program, by the requested program."""
+    words = (word.partition("=") for word in os.environ.get(WANTED, "").split())
+    return {name: ProgramRequest(on=True, encoding=encoding) for name, _, encoding in words}
+
+
 def _earlier_request(row: Row, running: Mapping[str, ProgramRequest]) -> ProgramRequest:
     return next((running[name] for name in row.programs if name in running), _NO)
 
@@ -89,7 +103,12 @@ class MediaRequests(Requests):
 
     def __init__(self, service: Service) -> None:
         super().__init__(service)
-        self._media = Media(service.config.on_demand_programs(), earlier_requests(), Notifier().request)
+        notifier = Notifier()
+        self._media = Media(
+            service.config.on_demand_programs(),
+            earlier_requests(),
+            lambda program, request: notifier.request(program, request.on, request.encoding),
+        )
 
     def take(self, channel: Channel, value: Any) -> None:
         if channel.kind is Kind.FLAG:

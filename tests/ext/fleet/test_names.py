@@ -273,4 +273,4 @@ class TestFlags:
         world.run()
         assert world.retained(FLAG) == (b"false", b"false")
         assert world.retained("incoming/flags/remote-mirror")[0] is None
-        assert not world.service.status.mirroring
+        assert not world.service.forwarder.mirroring.on

@@ -12,8 +12,7 @@ import pytest
 
 from pebble.contract import MQTT_VIDEO, VIDEO_CONTROL
 from pebble.contract.payloads import MediaRequest
-from pebble.runtime.parent import ProgramRequest
-from pebble.services.mqtt_bridge.requests.media import Media
+from pebble.services.mqtt_bridge.requests.media import Media, ProgramRequest
 from tests.kit.robot import ProgramRobot
 from tests.support import WAIT_S, Broker, gone, until
 

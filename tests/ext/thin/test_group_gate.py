@@ -116,7 +116,7 @@ def test_a_retained_group_is_stale(start: Start) -> None:
     world.remote.publish(GROUP, BOTH, retain=True)
     world.run(0.1)
     assert arrived(world) == []
-    assert world.service.status.counts[f"remote: {Drop.STALE.value}"] == 1
+    assert world.service.forwarder.counters[f"remote: {Drop.STALE.value}"] == 1
 
 
 @pytest.mark.parametrize(

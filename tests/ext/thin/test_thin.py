@@ -182,7 +182,7 @@ class TestNoRoom:
         world.uplink.way = FULL
         stream(world, IMU, 10)
         assert world.service.dropped()["shed"] > 400
-        assert world.service.status.counts["shed"] == world.service.dropped()["shed"]
+        assert world.service.forwarder.counters["shed"] == world.service.dropped()["shed"]
         assert len([line for line in caplog.messages if "has no room" in line]) == 1
 
 

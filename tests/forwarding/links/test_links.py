@@ -138,7 +138,7 @@ class Rig:
 
     @property
     def gate(self) -> Gate:
-        return self.service.status.gate
+        return self.service.forwarder.gate
 
     def client(self, side: Side) -> Client:
         """One more on that side; none receives its own messages."""
@@ -161,7 +161,7 @@ class Rig:
 
     @property
     def synchronized(self) -> bool:
-        return self.service.status.synchronized == {*Side}
+        return self.service.forwarder.retained.synchronized(*Side)
 
     def transport(self, side: Side) -> Transport:
         """The service's own."""
@@ -291,7 +291,8 @@ def test_a_retained_stop_passes_on_no_slow_link(make: Make, tmp_path: Path) -> N
     rig.start(ready=False)
 
     def arrived() -> int:
-        return sum(number for name, number in rig.service.status.counts.items() if name.startswith("remote: "))
+        counts = rig.service.forwarder.counters.snapshot()
+        return sum(number for name, number in counts.items() if name.startswith("remote: "))
 
     assert until(lambda: arrived() >= others)
     rig.wait_ready()

@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 
 from pebble.config import Config, parse
-from pebble.forwarding.routing import Side
 from pebble.forwarding.side import Gate
 from pebble.services.mqtt_bridge import service as bridge_module
 from pebble.services.mqtt_bridge.service import MqttBridge
@@ -105,7 +104,7 @@ class MemoryRig:
         self.robot_side = MemoryTransport("local-bridge", self.local_hub)
         bridge = MqttBridge(make_config(**section), self.robot_side)
         self._running.append(Running(bridge))
-        assert until(lambda: bridge.status.gate is Gate.OPEN and bridge.status.subscribed == {*Side})
+        assert until(lambda: bridge.forwarder.gate is Gate.OPEN and all(bridge.subscriptions.values()))
         return bridge
 
     def close(self) -> None:

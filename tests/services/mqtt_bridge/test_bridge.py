@@ -19,8 +19,8 @@ from pebble.contract.payloads import MediaRequest
 from pebble.forwarding.routing import Side
 from pebble.runtime import notes
 from pebble.runtime.notes import Held, Wanted
-from pebble.runtime.parent import NOTIFY_FD, WANTED, ProgramRequest
-from pebble.services.mqtt_bridge.requests.media import Media
+from pebble.runtime.parent import NOTIFY_FD, WANTED
+from pebble.services.mqtt_bridge.requests.media import Media, ProgramRequest
 from pebble.transports import Message, QoS
 from pebble.transports.memory import MemoryTransport
 from tests.forwarding.virtual import World

@@ -40,7 +40,7 @@ class ZenohHub:
         self._lock: FileLock | None = None
         self._session: zenoh.Session | None = None
         self._worker: HubWorker | None = None
-        self._store: HubStore | None = None
+        self.store: HubStore | None = None
         self._admission = admission or Admission(settings.wills, settings.unretained)
         self._certificates: Renewed[Any] | None = None
         if settings.tls is not None:
@@ -50,20 +50,13 @@ class ZenohHub:
         self._used = self._newest  # the certificates and rules of the session: first those in the files now
 
     @property
-    def retained(self) -> dict[str, bytes]:
-        """The retained payloads, by topic."""
-        if self._store is None:
-            return {}
-        return {retained.key: retained.payload for retained in self._store.retained()}
-
-    @property
     def refused_wills(self) -> int:
         return self._admission.refused
 
     @property
     def refused(self) -> int:
         """The number of retained messages and wills for which there was no room."""
-        return 0 if self._store is None else self._store.refused
+        return 0 if self.store is None else self.store.refused
 
     def open(self) -> ZenohHub:
         """Start the hub. Raises TransportError if the run directory has a hub already, or cannot be used."""
@@ -126,7 +119,7 @@ class ZenohHub:
             from pebble.transports.zenoh.hub.journal import Journal  # sqlite3, 2.5 MB
 
             journal = Journal(self._settings.journal)
-        self._store = store = HubStore(self._settings.max_wills)
+        self.store = store = HubStore(self._settings.max_wills)
         self._worker = HubWorker(self.name, store, self._admission, journal, self.counters)
         self._listen(self._worker)
 

@@ -5,7 +5,6 @@ from typing import Any
 import msgspec
 
 from pebble import contract as c
-from pebble.contract import codec
 from pebble.contract.capabilities import (
     AudioOffer,
     CapabilitiesValue,
@@ -28,7 +27,7 @@ def announced(base: str, payload: bytes) -> dict[str, Any]:
     """
     if len(payload) > _LARGEST or b'"subscribes"' not in payload:
         return {}
-    decoded = codec.json_object(payload) or {}
+    decoded = json_object(payload) or {}
     subscribes, value = decoded.get("subscribes"), decoded.get("value")
     if subscribes is None and isinstance(value, dict):  # a status has it inside its value
         subscribes = value.get("subscribes")
@@ -37,6 +36,15 @@ def announced(base: str, payload: bytes) -> dict[str, Any]:
     has = {channel for channel in _KNOWN if channel.suffix in subscribes}
     capabilities: dict[str, Any] = msgspec.to_builtins(_value(base, has)) if has else {}
     return capabilities
+
+
+def json_object(raw: bytes) -> dict[str, Any] | None:
+    """Return the JSON object in ``raw``; None if there is none."""
+    try:
+        value = msgspec.json.decode(raw)
+    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError):
+        return None
+    return value if isinstance(value, dict) else None
 
 
 _KNOWN = (

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from pebble.config import Config, load
-from pebble.config.text_files import password as password
 from pebble.errors import ConfigError, PebbleError, TransportError
 from pebble.extensions.operator.client.named_topics import NamedTopics
 from pebble.extensions.operator.client.names import ANY_ROBOT, Names, base_of
 from pebble.extensions.operator.client.robot_estop import RobotEstop
+from pebble.extensions.operator.client.url import password as password
 from pebble.extensions.operator.client.url import settings_of
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.connections import REMOTE_RECONNECT_S, local_settings, mqtt_settings, zenoh_settings

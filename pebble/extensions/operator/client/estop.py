@@ -11,8 +11,8 @@ from contextlib import suppress
 from enum import Enum
 from typing import NamedTuple
 
-from pebble.contract import AUTONOMY_COMMAND, DRIVE, ESTOP, ONLINE, STATUS, Channel, codec
-from pebble.contract.identity import Direction, parse_topic
+from pebble.contract import AUTONOMY_COMMAND, DRIVE, ESTOP, INCOMING, ONLINE, OUTGOING, STATUS, Channel, codec
+from pebble.contract.identity import parse_topic
 from pebble.contract.levels import silent_after
 from pebble.contract.payloads import AutonomyCommand, Drive, EstopCommand
 from pebble.errors import PayloadError
@@ -289,7 +289,7 @@ class StopSender:
         """Update from a message of a robot, retained or not."""
         self._now = now
         address = parse_topic(message.topic)
-        if address is None or address.direction is not Direction.OUTGOING:
+        if address is None or address.direction != OUTGOING:
             return
         base = address.identity.base
         is_sign_of_robot = message.payload and not address.identity.is_server  # empty: it removes a retained one
@@ -366,7 +366,7 @@ def _is_incoming(topic: str, base: str) -> bool:
 
     Publishing a stop there does no harm, and it may be the topic that drives this robot.
     """
-    return topic.startswith(f"{base}/{Direction.INCOMING}/") and not topic.endswith("/")
+    return topic.startswith(f"{base}/{INCOMING}/") and not topic.endswith("/")
 
 
 def _message(channel: Channel, topic: str, payload: bytes) -> Message:

@@ -8,10 +8,11 @@ from collections.abc import Callable, Iterator
 
 import msgspec
 
-from pebble.contract import DRIVE, ESTOP, codec
-from pebble.contract.identity import Direction, ParsedTopic, parse_topic
+from pebble.contract import DRIVE, ESTOP, INCOMING, codec
+from pebble.contract.identity import ParsedTopic, parse_topic
 from pebble.contract.names import BY, NAME, with_name
 from pebble.errors import PayloadError, TransportError
+from pebble.extensions.operator.client.announced import json_object
 from pebble.transports import Message
 
 
@@ -66,7 +67,7 @@ class NamedTopics:
         command = _command(topic) if person else None
         if command is None or not self._is_named(command.identity.base):
             return payload
-        plain = codec.json_object(payload)
+        plain = json_object(payload)
         if plain is None:
             return payload
         body = plain["value"] if isinstance(plain.get("value"), dict) else plain  # that has the command's fields
@@ -79,7 +80,7 @@ class NamedTopics:
 def _command(topic: str) -> ParsedTopic | None:
     """Return the parts of a command's topic, if it has no account yet."""
     parsed = parse_topic(topic)
-    if parsed is None or parsed.direction is not Direction.INCOMING or parsed.metric.startswith(f"{BY}/"):
+    if parsed is None or parsed.direction != INCOMING or parsed.metric.startswith(f"{BY}/"):
         return None
     return parsed
 
@@ -96,7 +97,7 @@ def _without_claim(payload: bytes, account: str) -> bytes:
     """Return the payload without its sender if that is the account, which the topic names already."""
     if f'"{account}'.encode() not in payload:
         return payload
-    command = codec.json_object(payload)
+    command = json_object(payload)
     if command is None or str(command.get("by")).partition("@")[0] != account:
         return payload
     return msgspec.json.encode({key: value for key, value in command.items() if key != "by"})

@@ -3,8 +3,8 @@
 from typing import Any
 
 from pebble import contract as c
-from pebble.contract import channel_of
-from pebble.contract.identity import Direction, parse_topic
+from pebble.contract import OUTGOING, channel_of
+from pebble.contract.identity import parse_topic
 from pebble.errors import TransportError
 from pebble.transports.topics import check_topic
 
@@ -25,7 +25,7 @@ SYNONYMS = tuple(channel for channel in c.CHANNELS if channel.synonym_of is not 
 WATCHED = tuple(
     channel
     for channel in c.CHANNELS
-    if channel.direction == Direction.OUTGOING
+    if channel.direction == OUTGOING
     and channel.payload is not bytes
     and channel.remote
     and channel not in FLEET

@@ -7,7 +7,7 @@ from typing import Any
 
 from pebble import contract as c
 from pebble.contract import codec
-from pebble.contract.levels import link_of, silent_after
+from pebble.contract.levels import silent_after
 from pebble.contract.payloads import AutonomyStatus, Drive, EstopState, LinkLevel, LinkState
 from pebble.errors import PayloadError
 from pebble.extensions.operator.client import assumed
@@ -138,7 +138,7 @@ class RobotView:
         elif channel is c.CONTROL_STATE:
             self.control.receive(message)
         elif channel is c.LINK:
-            self.link = link_of(message.payload)  # no link, or an unreadable one, counts as wide
+            self.link = _link_of(message.payload)  # no link, or an unreadable one, counts as wide
             self.liveness.link = "wide" if self.link is None else self.link.level
         elif channel is c.STATUS:
             self._status = message.payload
@@ -340,3 +340,11 @@ class RobotView:
 
 _FOR_STOPS = (c.ONLINE, c.CAPABILITIES, c.ESTOP_STATE)
 _DECODED = (c.ONLINE, *SYNONYMS, c.CHARGING_LEVEL, c.CHARGING_STATUS, c.AUTONOMY_STATUS)
+
+
+def _link_of(payload: bytes) -> LinkState | None:
+    """Return the state in a message on ``outgoing/link``; None if it was removed, or cannot be read."""
+    try:
+        return codec.decode(c.LINK, payload) if payload else None
+    except PayloadError:
+        return None

@@ -1,9 +1,11 @@
 """The address of a connection: ``mqtt://host:port``, ``mqtts://host:port`` or ``zenoh:<run_dir>``."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
 from pebble.config.hosts import HostError, broker_host, split
+from pebble.config.text_files import read_password
 from pebble.errors import PebbleError
 from pebble.runtime.connections import ALL_VITAL
 from pebble.transports import MqttSettings, TlsSettings, ZenohSettings
@@ -30,6 +32,11 @@ def settings_of(
     if scheme in _PORTS and rest.startswith("//"):
         return "mqtt", replace(_mqtt(url, password, ca_cert), password_file=password_file)
     raise UrlError(f"--url must be {FORMS}")
+
+
+def password(file: Path | None) -> str | None:
+    """Return the broker's password: the text of ``file``, or the environment's value. Raises PebbleError."""
+    return os.environ.get("PEBBLE_PASSWORD") if file is None else read_password(file, "--password-file")
 
 
 def _zenoh(path: str) -> ZenohSettings:

@@ -62,10 +62,10 @@ def with_target(*, program: str = "tool", robot: bool = False) -> Callable[[Call
 
 def broker_of(option: str, url: str, password_file: Path | None, ca_cert: Path | None) -> MqttSettings:
     """Return the settings of the MQTT broker that an option names. Raises PebbleError."""
-    from pebble.config.text_files import password
     from pebble.extensions.operator.client.url import (  # not all commands that use this module connect
         FORMS,
         UrlError,
+        password,
         settings_of,
     )
     from pebble.transports import MqttSettings

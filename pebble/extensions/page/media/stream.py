@@ -10,8 +10,7 @@ from typing import Any, Final, Generic, TypeVar
 
 from starlette.websockets import WebSocket
 
-from pebble.contract import Channel
-from pebble.contract.identity import Direction
+from pebble.contract import OUTGOING, Channel
 from pebble.extensions.media.rate_meter import RateMeter
 from pebble.extensions.operator.client.broker import Broker
 from pebble.extensions.operator.client.media_request.offer import Medium
@@ -188,7 +187,7 @@ class Streams(Generic[StreamT]):
         self, websocket: WebSocket, ref: str, viewer: Any, *work: Callable[[StreamT], Coroutine[Any, Any, None]]
     ) -> None:
         """Serve a page's socket while it views that robot, until one part of ``work`` ends; then close the socket."""
-        if self._closed or not own_topic(ref, self._channel.topic(ref), Direction.OUTGOING):
+        if self._closed or not own_topic(ref, self._channel.topic(ref), OUTGOING):
             await websocket.close(_BAD_REQUEST, "no such component")
             return
         stream = self._open(ref)

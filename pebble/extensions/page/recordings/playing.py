@@ -21,7 +21,6 @@ import msgspec
 
 from pebble import contract as c
 from pebble.contract.channels import LOGS
-from pebble.contract.identity import Direction
 from pebble.errors import PebbleError
 from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.extensions.page import messages as m
@@ -252,7 +251,7 @@ class PlayedRobot:
             # A recording has one clock: it stands for the monotonic one and for the time of day.
             self._robot.receive(channel, Message(message.channel.topic, payload, retain=retained), received, received)
         try:
-            payload = shown(c.channel_of(f"{Direction.OUTGOING}/{metric}"), payload, msgspec.json.decode(payload))
+            payload = shown(c.channel_of(f"{c.OUTGOING}/{metric}"), payload, msgspec.json.decode(payload))
         except (ValueError, RecursionError):  # msgspec's are ValueErrors
             return
         self._values[metric] = msgspec.Raw(payload), received * 1e3

@@ -8,8 +8,9 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from pebble.contract import INCOMING
 from pebble.contract.channels import LOGS
-from pebble.contract.identity import Direction, parse_topic
+from pebble.contract.identity import parse_topic
 from pebble.errors import PebbleError
 from pebble.extensions.recordings.files.reader import Chunk, RecordingFile
 from pebble.extensions.recordings.files.recorded import FOREVER_NS, Channel, Recorded
@@ -191,7 +192,7 @@ def metric_of(topic: str) -> tuple[str, bool]:
     parsed = parse_topic(topic)
     if parsed is None:
         return topic, False
-    return parsed.metric, parsed.direction is Direction.INCOMING
+    return parsed.metric, parsed.direction == INCOMING
 
 
 def messages_of(

@@ -28,7 +28,7 @@ from pebble.extensions.media.speech import Speech
 from pebble.services.av_daemon import alsa, capture_program, sources
 from pebble.services.av_daemon.alsa import AlsaMicrophone
 from pebble.services.av_daemon.capture_program import CaptureProgram
-from pebble.services.av_daemon.health import Asked, Health
+from pebble.services.av_daemon.health import Asked, Health, RateCheck
 from pebble.services.av_daemon.jpeg_splitter import JpegSplitter
 from pebble.services.av_daemon.libcamera import LibcameraCamera
 from pebble.services.av_daemon.source import Capture, Source
@@ -355,3 +355,13 @@ def test_the_error_without_a_world_names_the_command_that_starts_it(path: Path) 
         camera_of(path)
     health = Health(2.0)
     assert [health.failed("absent", expected=True) for _ in range(4)] == [2.0] * 4, "it is looked for all the time"
+
+
+@pytest.mark.parametrize(("hz", "asked", "found"), [(13, 15, None), (10, 15, 10), (19, 15, 19), (3, 0, None)])
+def test_rates(hz: int, asked: float, found: float | None) -> None:
+    check = RateCheck(asked)
+    for number in range(2 * hz):
+        check.count(1, 100 + number / hz / 10)  # a start in a hurry
+    for number in range(13 * hz):
+        check.count(1, 102 + number / hz)
+    assert check.wrong_hz == (None if found is None else pytest.approx(found, rel=0.05))
