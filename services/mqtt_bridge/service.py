@@ -255,11 +255,12 @@ class MqttBridge(ForwardingService):
         """Open the forwarder's gate if the two sides cannot be one broker; otherwise begin a round of probing."""
         if not self._same_broker.possible:
             if self._same_broker.announces:
-                self._same_broker.send()  # so a mirror of the remote broker shuts before anything is forwarded
+                self._same_broker.send()  # our mirror learns by it whether its broker is the remote one
             self._open()
         if self.forwarder.gate is Gate.OPEN or not self._same_broker.both_connected:
             return
-        round_ = self._same_broker.begin_round(self.subjects.topics(c.DRIVE)[0])  # for a barrier: subscribed to anyway
+        # A message to a topic that is subscribed to anyway comes back after all probes that were sent before it.
+        round_ = self._same_broker.begin_round(self.subjects.topics(c.DRIVE)[0])
         if round_ is not None:  # else a connection is missing: the next one begins a round
             wait_s = _PROBE_WAIT_S if self.forwarder.gate is Gate.WAITING else _AGAIN_WAIT_S  # SHUT: a probe came back
             self.call_at(self.clock() + wait_s, partial(self._end_round, round_))

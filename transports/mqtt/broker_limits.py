@@ -49,7 +49,7 @@ class Limits(Struct, frozen=True):
 
 
 EVERYTHING: Final = Limits()
-#: With these a CONNECT is tried, one after the other, while the broker hangs up.
+#: With these a CONNECT is tried, one after the other, while the broker hangs up; after the last one no more.
 _STEPS: Final = (EVERYTHING, Limits(qos=0), Limits(retain=False), Limits(retain=False, qos=0), Limits(will=False))
 
 
@@ -96,7 +96,8 @@ class BrokerLimits:
     def note_connect(self, result: Result, now: float) -> None:
         """Note how a CONNECT has ended whose will was fitted to `limits`. The first line that fits counts.
 
-        *Again*: it was sent at once, after an accepted probe or with less than the one before. *First*: any other.
+        *Again*: it was sent at once, after an accepted probe or with less than the one before (`Asking.AGAIN`).
+        *First*: any other. After "at once" the result of the next CONNECT is noted here, too.
 
         | result                             | tried | the next CONNECT is                                |
         |------------------------------------|-------|----------------------------------------------------|
@@ -120,4 +121,5 @@ class BrokerLimits:
             self.limits = EVERYTHING
 
     def _reduce(self, limits: Limits, now: float) -> None:
+        """Connect again at once, with these limits."""
         self.limits, self._since, self._asking = limits, now, Asking.AGAIN

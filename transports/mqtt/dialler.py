@@ -188,7 +188,7 @@ class Dialler:
         ``held_s``: how long a connection lasted, or 0. Return the problem in words ("": none yet), and True to log it.
         """
         addresses, asks_again = self.addresses, self.limits.asks_again
-        if self._is_last_attempt and not asks_again:  # this broker will not be asked once more
+        if self._is_last_attempt and not asks_again:  # it was asked in every way: bridge mode, limits
             why = problem.removeprefix(f"{addresses.where} ")  # the list of failures names the addresses
             failures = addresses.failed(why, held_s)
             if addresses.several:

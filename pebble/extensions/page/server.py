@@ -264,7 +264,7 @@ class Server:
 
 
 async def expand(settings: MqttSettings) -> None:
-    """Take groups of streams apart, on a connection of their own, until this is cancelled."""
+    """Publish the streams of each group one by one, as `pebble topic expand` does, until this is cancelled."""
     broker = Broker(settings, "pebble-web-expander")
     expander = Expander(broker.transport)
     broker.is_named = expander.is_named

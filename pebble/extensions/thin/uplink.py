@@ -107,7 +107,10 @@ def make_uplink(
     notifier: Notifier,
     clock: Callable[[], float],
 ) -> Uplink:
-    """Return the uplink of a robot: a thin one if its link may be thin, else a plain one with a gate for groups."""
+    """Return the uplink of a robot: a thin one if its link may be thin, else a plain one.
+
+    A page may send streams in groups on any link. Beside a plain uplink a gate takes them apart.
+    """
     if config.services.mqtt_bridge.link.profile != "wide":
         return ThinUplink(config, addresses, remote, forwarder, notifier, clock)
     uplink = Uplink()

@@ -148,7 +148,10 @@ class CarriedRobot:
         )
 
     def subscribing(self, side: Side, *below: str) -> dict[str, Handler]:
-        """Return the subscriptions to make on ``side``, whose retained messages arrive from now on."""
+        """Return the subscriptions to make on ``side`` and expect retained messages there until :meth:`subscribed`.
+
+        ``below``: filters of metrics below the robot's base topic.
+        """
         self.forwarder.sides[side].subscribing()
         return {f"{self.base}/{metrics}": partial(self.receive, side) for metrics in below}
 

@@ -110,7 +110,7 @@ def make(places: Places) -> Backup:
 
 
 def _files(places: Places, config: Config) -> Iterator[Path]:
-    """Yield the files that cannot be made again, also those elsewhere that the config or the broker's file names."""
+    """Yield the files that cannot be made again, also those in other places that are named in the config files."""
     without = [_here(places, folder) for _, folder in _left_out(config)]
     for folder in (places.etc, places.state, _here(places, config.state_dir())):
         yield from _below(folder, without)

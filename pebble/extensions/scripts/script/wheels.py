@@ -43,7 +43,9 @@ class Wheels:
         self._over = False  # the script has ended
         self._robot = addresses.base.rpartition("/")[2]
         self._reported: str | None = None  # why commands had no effect, as logged last; None: nothing was
-        for channel in (ESTOP_STATE, CAPABILITIES):  # direct: what is retained has arrived when this returns
+        # First the states of motor owners: the run's number is above those that they bar (`_barred`). direct: what is
+        # retained has arrived when subscribe returns.
+        for channel in (ESTOP_STATE, CAPABILITIES):
             transport.subscribe(channel.filter(addresses.base), self._receive_owner, direct=True)
         self._sender = DriveSender(number(self._barred), self._publish)
         transport.subscribe(self._address.topic, self._receive_drive, limit=_WAITING)
