@@ -415,7 +415,7 @@ def test_a_manifest_cleared_by_another_is_published_again(rig: SerialRig) -> Non
     rig.listener("late").described("lamp-1")
 
 
-PLUGGED_IN_S = 4.0  # two seconds on a machine with nothing else to do
+PLUGGED_IN_S = 3.0  # two seconds on a machine with nothing else to do
 
 
 @pytest.mark.alone

@@ -12,6 +12,7 @@ import heapq
 from collections import deque
 from collections.abc import Callable
 from itertools import count
+from math import inf
 from typing import Any
 
 from pebble.runtime.service import Service
@@ -155,9 +156,8 @@ class ServiceProcess(Process):
         while service.turn(0):
             if not service.running:
                 raise AssertionError(f"{self.name} ends by itself")
-        wait = service.timers.wait(self.scheduler.now)
-        if wait is not None:
-            self.turn_at(self.scheduler.now + wait)
+        if service.timers.next_due < inf:
+            self.turn_at(max(self.scheduler.now, service.timers.next_due))
 
 
 Noted = Callable[[Process, Message], None]

@@ -85,7 +85,7 @@ def test_a_refused_start_leaves_the_running_script_alone(bench: Bench) -> None:
 
 def test_nonsense_does_nothing(bench: Bench) -> None:
     walk = bench.start("walk")
-    for body in ({"file": "sing"}, {"action": "dance"}, b"\xff", b"[" * 5000, 7, {"action": "stop", "config": 3}):
+    for body in ({"file": "sing"}, {"action": "dance"}, b"\xff", b"[" * 5000, 7):
         bench.command(body)
     bench.quiet()
     assert (walk.signals, bench.children.files) == ([], ["walk"])
