@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar, Protocol
 
 from pebble import contract as c
 from pebble.contract.groups import Member
@@ -32,14 +32,27 @@ _AGAIN_S = 0.5  # while motors run, for an odometry that began after them
 _LIGHTS = "lights"  # a steady colour and a fade replace one another
 
 
+class MotorProtocol(Protocol):
+    """The functions of a text protocol that drives motors; a module can be one, as goob_base is."""
+
+    def parse(self, line: bytes) -> list[Report]: ...
+    def mix(self, x: float, z: float) -> tuple[float, float]: ...
+    def drive_line(self, left: float, right: float) -> bytes: ...
+    def lights_line(self, blue: float, green: float, red: float) -> bytes: ...
+    def flash_line(self, blue: float, green: float, red: float, period_s: float) -> bytes: ...
+
+
 class MotorBridge(MotorOwner, SerialService):
     """A motor board on a serial line, as a motor owner.
 
     SerialLine sends the stop line when it opens, and in close(), which :meth:`on_stop` calls.
+
+    A bridge of another text protocol sets ``protocol`` and ``stop_line``.
     """
 
     publishes = (*MotorOwner.publishes, c.MOTOR_POWER, c.TOUCH_SENSORS, c.CHARGING_STATUS, c.CHARGING_LEVEL)
     company = (c.LIGHTS_SOLID, c.LIGHTS_FLASH)
+    protocol: ClassVar[MotorProtocol] = goob_base
     stop_line = goob_base.STOP
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
@@ -65,13 +78,13 @@ class MotorBridge(MotorOwner, SerialService):
         super().start()
 
     def move(self, drive: Drive, valid_s: float) -> None:
-        power = goob_base.mix(drive.x, drive.z)
-        self.line.drive(goob_base.drive_line(*power), valid_s)
+        power = self.protocol.mix(drive.x, drive.z)
+        self.line.drive(self.protocol.drive_line(*power), valid_s)
         self._note_power(*power, valid_s)
 
     def move_with(self, drive: Drive, valid_s: float, company: tuple[Member, ...]) -> None:
-        power = goob_base.mix(drive.x, drive.z)
-        line = goob_base.drive_line(*power) if drive.moves else self.stop_line
+        power = self.protocol.mix(drive.x, drive.z)
+        line = self.protocol.drive_line(*power) if drive.moves else self.stop_line
         valid_s = valid_s if drive.moves else float("inf")
         self.line.drive(line + self._lights_line(company[0].value), valid_s, replaces=_LIGHTS)
         self._note_power(*power, valid_s)
@@ -106,8 +119,8 @@ class MotorBridge(MotorOwner, SerialService):
 
     def _lights_line(self, colour: LightsSolid) -> bytes:
         if isinstance(colour, LightsFlash):
-            return goob_base.flash_line(colour.b, colour.g, colour.r, colour.period)
-        return goob_base.lights_line(colour.b, colour.g, colour.r)
+            return self.protocol.flash_line(colour.b, colour.g, colour.r, colour.period)
+        return self.protocol.lights_line(colour.b, colour.g, colour.r)
 
     def on_line_state(self, state: LineState) -> None:
         if state is LineState.BOOTING:
@@ -115,7 +128,7 @@ class MotorBridge(MotorOwner, SerialService):
 
     def on_input(self, chunk: bytes) -> None:
         for line in self._splitter.feed(chunk):
-            reports = goob_base.parse(line)
+            reports = self.protocol.parse(line)
             for report in reports:
                 self.note_report(is_known(report))
                 self._report(report)
