@@ -8,7 +8,7 @@ _KEY = re.compile(_NAMES, re.IGNORECASE).search
 _NAME = rf"[\w-]{{0,40}}(?:{_NAMES}|pwd)[\w-]{{0,40}}"
 _PAIR = re.compile(rf"(\b(?:{_NAME}|[\w-]{{0,40}}\bsig(?:nature)?)=)[^&\s]+", re.IGNORECASE)  # of a query or an option
 _HEADER = re.compile(
-    r"""(\b(?:authorization|cookie|x-[\w-]{0,40}(?:key|auth))\\?["']?\s*:\s*\\?["']?)[^\s\\"'][^\\"'\n]*""",
+    r"""(\b(?:authorization|cookie|x-[\w-]{0,40}(?:key|auth|token|secret))\\?["']?\s*:\s*\\?["']?)[^\s\\"'][^\\"'\n]*""",
     re.IGNORECASE,
 )
 _END = r"(?<!_file)(?<!_env)"  # of a name; what is in a file or a variable stays there
@@ -16,7 +16,8 @@ _END = r"(?<!_file)(?<!_env)"  # of a name; what is in a file or a variable stay
 _MEMBER = re.compile(
     rf'("{_NAME}{_END}"\s*:\s*")(?:[^"\\]|\\.)+'
     rf'|(\\"{_NAME}{_END}\\"\s*:\s*\\")[^"\\]+'
-    rf"|('{_NAME}{_END}'\s*:\s*')(?:[^'\\]|\\.)+",
+    rf"|('{_NAME}{_END}'\s*:\s*b?')(?:[^'\\]|\\.)+"
+    rf"|('{_NAME}{_END}'\s*:\s*b?\")(?:[^\"\\]|\\.)+",
     re.IGNORECASE,
 )
 is_secret_option = re.compile(rf"--?{_NAME}", re.IGNORECASE).fullmatch
@@ -41,7 +42,7 @@ def without_secrets(text: str) -> str:
     if _AT.search(text):
         text = re.sub(r"\S+", _without_login, _LOGIN_WITH_BLANKS.sub(rf"\1{HIDDEN}@", text))
     text = _PAIR.sub(rf"\1{HIDDEN}", text) if "=" in text else text
-    hidden = rf"\1\2\3{HIDDEN}"  # of the three groups one is not empty
+    hidden = rf"\1\2\3\4{HIDDEN}"  # of the four groups one is not empty
     return _MEMBER.sub(hidden, _HEADER.sub(rf"\1{HIDDEN}", text)) if ":" in text else text
 
 

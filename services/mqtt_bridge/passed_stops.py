@@ -47,8 +47,10 @@ class Pending(Struct, frozen=True):
     at: float
     before: EstopState | None
 
-    def is_counted(self, state: EstopState) -> bool:
-        return self.before is not None and self.before.boot == state.boot and state.count > self.before.count
+    def is_confirmed(self, state: EstopState) -> bool:
+        """True if ``state`` shows the stop, except while a latched owner still has to save it."""
+        counts = self.before is not None and self.before.boot == state.boot and state.count > self.before.count
+        return (counts or str(self.stop.stop) in state.recent) and _is_saved(state)
 
 
 class Owner:
@@ -62,8 +64,7 @@ class Owner:
 
     def confirms(self, name: str) -> bool:
         """True if the owner's newest state names this stop, except while a latched owner still has to save it."""
-        state = self.state
-        return state is not None and name in state.recent and (state.persisted is not False or not state.latched)
+        return self.state is not None and name in self.state.recent and _is_saved(self.state)
 
     def follow(self, state: EstopState | None, now: float) -> None:
         """Note the owner's newest state; None: the owner has withdrawn it."""
@@ -79,8 +80,12 @@ class Owner:
         )
         if was_stopped and not state.latched:
             self.freed_at = now
-        if (pending := self.pending) and (self.confirms(str(pending.stop.stop)) or pending.is_counted(state)):
+        if self.pending is not None and self.pending.is_confirmed(state):
             self.pending = None
+
+
+def _is_saved(state: EstopState) -> bool:
+    return state.persisted is not False or not state.latched
 
 
 class PassedStops:

@@ -137,6 +137,8 @@ def test_a_secret_on_a_command_line_is_not_printed_again(run: Run) -> None:
         (f'{{"api_key": "{SECRET}", "x": 1}}', '{"api_key": "***", "x": 1}'),
         (f'{{"password" : "{SECRET}"}}', '{"password" : "***"}'),
         (f"{{'mqtt_password': '{SECRET}', 'port': 1}}", "{'mqtt_password': '***', 'port': 1}"),
+        (f"""{{'password': "it's {SECRET}", 'pass': b'{SECRET}'}}""", """{'password': "***", 'pass': b'***'}"""),
+        (f"X-Auth-Token: {SECRET}", "X-Auth-Token: ***"),
         (f'"{{\\"api_key\\": \\"{SECRET}\\"}}"', '"{\\"api_key\\": \\"***\\"}"'),
         (f'curl -H "Authorization: Bearer {SECRET}" x', 'curl -H "Authorization: ***" x'),
         (f'"{{\\"Cookie\\": \\"{SECRET}; b\\"}}"', '"{\\"Cookie\\": \\"***\\"}"'),

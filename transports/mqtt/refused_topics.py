@@ -99,8 +99,10 @@ class RefusedTopics:
             suspects = {topic: size for topic, size in often.items() if not self._is_vital(topic)}
         if len(suspects) == 1:
             self._blame(where, *suspects.popitem(), now)
-        elif suspects:  # any of them, at any size (0): their trials will show which
-            self.withheld |= {topic: Withheld(0, now) for topic in suspects if len(self.withheld) < TOPICS}
+        elif suspects:  # any of them, at any size (0) if it is not vital: their trials will show which
+            for topic in suspects:
+                if len(self.withheld) < TOPICS:
+                    self.withheld[topic] = Withheld(LARGE if self._is_vital(topic) else 0, now)
         elif not ordinary:  # only vital ones, which are sent all the same
             for topic, size in often.items():
                 why = f"{_closes(size)}, without which this account cannot run a robot"

@@ -33,7 +33,6 @@ CallIn: TypeAlias = Callable[[float, Callable[[], None]], Timer]  # calls later,
 WATCH_S = LEVELS["thin"].silent_s + 1.0  # in which another robot of that name would send a heartbeat
 _ARRIVE_S = 2.0  # for what a broker retains
 _OFFLINE = re.compile(rb'"online"\s*:\s*false')
-_FREE = b'"latched": false'  # in the file of a motor owner that no stop holds
 _NAMES = 16  # that are remembered
 _TOPICS = 1000  # that are removed of one name
 
@@ -41,7 +40,7 @@ _TOPICS = 1000  # that are removed of one name
 def keep_stops(config: Config) -> None:
     """Remember the robot's name, and keep its stops if it or a motor owner had another name at the last start.
 
-    Raises PebbleError if a stop cannot be kept.
+    The old file is removed then, or its stop would come back with its name. Raises PebbleError if one cannot be kept.
     """
     if config.path is None:
         return
@@ -49,21 +48,32 @@ def keep_stops(config: Config) -> None:
     before = names[-1] if names else config.base
     targets = [config.state_file(f"estop-{owner}") for owner in config.motor_owners]
     for file in _stop_files(config, before):
-        for target in targets if file not in targets and _FREE not in _saved(file) else ():
-            if before != config.base or not target.exists():  # else the owner knows better
-                write(target, _saved(file), 0o600, PebbleError)
-                log.warning("stopped, as it was before names in the config were changed: %s", file)
+        # Under the same name an owner that has a file knows better.
+        kept_in = [target for target in targets if before != config.base or not target.exists()]
+        saved = _saved(file)
+        if file in targets or not kept_in or _is_free(saved):
+            continue
+        for target in kept_in:
+            write(target, saved, 0o600, PebbleError)
+        log.warning("stopped, as it was before names in the config were changed: %s", file)
+        with suppress(OSError):
+            file.unlink()
     if before != config.base or not names:
         _remember(config, [*(name for name in names if name != config.base), config.base])
 
 
 def _stop_files(config: Config, base: str) -> list[Path]:
-    """Return the files that motor owners have saved under this name."""
-    end = f"-{file_name(base)}.json"
-    with suppress(OSError):  # no folder
-        files = [*_folder(config, file_name(base)).iterdir()]
-        return [file for file in files if file.name.startswith("estop-") and file.name.endswith(end)]
-    return []
+    """Return the files that motor owners have saved under this name. Raises PebbleError."""
+    folder, end = _folder(config, file_name(base)), f"-{file_name(base)}.json"
+    try:
+        files = [*folder.iterdir()]
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        if base == config.base:  # its owners try to read their files, and without them start stopped
+            return []
+        raise PebbleError(f"{folder}: {error.strerror}: stops of {base} may be there, let its user read it") from None
+    return [file for file in files if file.name.startswith("estop-") and file.name.endswith(end)]
 
 
 def _names_of(config: Config) -> list[str]:
@@ -85,13 +95,20 @@ def _remember(config: Config, names: list[str]) -> None:
 
 
 def _saved(file: Path) -> bytes:
-    """Return the state that a motor owner has saved; empty, which counts as a stop, if it cannot be read."""
+    """Return the state that a motor owner has saved; empty if it cannot be read."""
     try:
         return file.read_bytes()
-    except FileNotFoundError:
-        return _FREE
     except OSError:
         return b""
+
+
+def _is_free(saved: bytes) -> bool:
+    """True if no stop holds the owner whose state this is. What cannot be parsed is a stop, as for the owner itself."""
+    try:
+        state = json.loads(saved)
+    except (ValueError, RecursionError):
+        return False
+    return isinstance(state, dict) and state.get("latched") is False and isinstance(state.get("recent"), list)
 
 
 def _file(config: Config) -> Path:

@@ -76,13 +76,14 @@ def _rights(trial: BrokerTrial, peer: Peer, topic: str, reads: str, *, must_come
         why = refusal or "it does not come back (or may this account not read it?)"
         fix = f"allow it to write and read {topic.rpartition('/')[0]}/# on the broker"
         return failed(f"this account may not publish to {topic}: {why}", fix)
-    if not must_come_back and (why := _why_deaf(trial, peer, topic.replace("/outgoing/", "/incoming/"))):
+    if not must_come_back and (why := _why_deaf(trial, topic.replace("/outgoing/", "/incoming/"))):
         return failed(why, "allow it to read what it subscribes to on the broker")
     return ok("accepts what this account publishes")
 
 
-def _why_deaf(trial: BrokerTrial, peer: Peer, topic: str) -> str:
+def _why_deaf(trial: BrokerTrial, topic: str) -> str:
     """Publish a probe among a robot's commands; return why it is not delivered, empty if it is or is refused."""
+    peer = trial.peer(protocol=trial.settings.protocol)  # which the broker may close
     peer.subscribe(topic)
     is_back, refusal = _echo(trial, peer, topic)
     return "" if is_back or refusal else f"this account may not read {topic}: commands and stops do not reach the robot"

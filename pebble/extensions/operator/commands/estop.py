@@ -192,7 +192,7 @@ def _heartbeats(target: Target, *, every: bool) -> Iterator[Heartbeats | None]:
 
 def _drop_other_spelling(sender: StopSender) -> None:
     """Stop no more the robot whose name only looks like that of the one that was heard."""
-    heard = [base for base, robot in sender.robots.items() if robot.live or robot.estop.has_capabilities]
+    heard = [base for base, robot in sender.robots.items() if robot.live or robot.progress is Progress.CONFIRMED]
     if sender.order.named and heard:
         sender.robots = {base: sender.robots[base] for base in heard}
 

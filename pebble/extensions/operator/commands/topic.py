@@ -6,6 +6,7 @@ import math
 import shutil
 import sys
 import time
+from contextlib import nullcontext
 from functools import cache
 from typing import Annotated
 
@@ -164,7 +165,8 @@ def pub(
         pebble topic pub flags/mqtt-video true -c fred.json
         pebble topic pub lights-flash @party.json --url mqtt://127.0.0.1 -r goob
     """
-    with until_ended(), connected(target) as (transport, names):
+    repeats = rate is not None and count is None
+    with until_ended() if repeats else nullcontext(), connected(target) as (transport, names):
         message = draft(names, topic, payload, retain=retain, qos=qos, force=force)
         for warning in message.warnings:
             typer.echo(f"pebble: warning: {warning}", err=True)
