@@ -308,6 +308,7 @@ STOPPED, FREE = '{"latched": true, "recent": []}', '{"latched": false, "recent":
     [
         (("rover", "rover-two"), STOPPED, None, STOPPED),
         (("rover", "rover-two"), "damaged", FREE, "damaged"),
+        (("rover", "rover-two"), FREE[:-4], FREE, FREE[:-4]),
         (("rover", "rover-two"), FREE, STOPPED, STOPPED),
         (("rover", "rover-two"), FREE, None, None),
         (("serial", "left"), STOPPED, None, STOPPED),
@@ -336,6 +337,7 @@ def test_a_stopped_robot_stays_stopped_under_another_name(
             files[-1].write_text(content)
         keep_stops(config)
     assert (files[1].read_text() if files[1].exists() else None) == kept
+    assert files[0].exists() is not (kept == before), "a stop does not come back with its earlier name"
     files[1].write_text(FREE)
     keep_stops(load(path))
     assert files[1].read_text() == FREE, "it was reset"

@@ -186,13 +186,18 @@ def test_the_bridge_repeats_it_on_the_robots_side_only(monkeypatch: pytest.Monke
     assert not world.remote.on(STOP)
 
 
-@pytest.mark.parametrize(("boot", "repeats"), [("00000001", False), ("00000002", True)])
-def test_without_a_name_an_owner_that_lives_gets_it_once(boot: str, repeats: bool) -> None:
+@pytest.mark.parametrize(
+    ("boot", "persisted", "repeats"), [("00000001", True, False), ("00000001", False, True), ("00000002", True, True)]
+)
+def test_without_a_name_an_owner_that_lives_and_saves_it_gets_it_once(
+    boot: str, persisted: bool, repeats: bool
+) -> None:
     stops = PassedStops(ONE, lambda: 0.0)
     stops.follow("serial", FREE)
     stops.accept(payload("a"), nameless=True)
     assert stops.repeat()
-    stops.follow("serial", replace_state(FREE, boot=boot, latched=True, count=1, recent=[NAME["b"]]))
+    state = replace_state(FREE, boot=boot, latched=True, count=1, recent=[NAME["b"]], persisted=persisted)
+    stops.follow("serial", state)
     assert bool(stops.repeat()) is repeats
 
 
