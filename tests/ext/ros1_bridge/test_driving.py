@@ -150,8 +150,7 @@ def test_a_new_base_hears_a_zero_first_and_a_lock_while_it_is_stopped(
         busy.setattr(cmd_vel, "_SURE_S", WAIT_S)
         husky.reset()
         husky.ros.kill("base")
-        assert until(lambda: not husky.bridge.cmd_vel.bases)
-    husky.end()
+        husky.end()
     husky.start()
     up = husky.ros.start_base()
     assert until(lambda: husky.ros.locks(up)), "an earlier life has locked it"
