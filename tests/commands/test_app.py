@@ -111,6 +111,7 @@ def test_a_robot_runs_without_standard_streams(tmp_path: Path, closed: str) -> N
 
 
 _AT = ["--url", "URL"]
+_PUBLISH = ["topic", "pub", "a/b", "{}", "--rate", "10", *_AT]
 #: Commands that run until they are ended. The first of each row prints something once all of them work.
 UNTIL_ENDED = [
     [["up", "CONFIG"]],
@@ -120,11 +121,12 @@ UNTIL_ENDED = [
     [["foxglove", *_AT, "--port", "0"]],
     [["exporter", *_AT, "--port", "0"]],
     [["fleet", "hub", "HUB"]],
-    [["topic", "echo", "a/b", *_AT], ["topic", "pub", "a/b", "{}", "--rate", "10", *_AT]],
+    [["topic", "echo", "a/b", *_AT], _PUBLISH],
+    [["topic", "hz", "a/b", *_AT], _PUBLISH],
 ]
 
 
-@pytest.mark.parametrize("commands", UNTIL_ENDED, ids=lambda commands: " ".join(commands[-1][:2]))
+@pytest.mark.parametrize("commands", UNTIL_ENDED, ids=lambda commands: " ".join(commands[0][:2]))
 def test_sigterm_is_the_orderly_end_of_a_command_that_runs_until_then(
     tmp_path: Path, broker: Broker, commands: list[list[str]]
 ) -> None:

@@ -29,7 +29,7 @@ from pebble.launcher.sd_notify import SystemdNotifier
 from pebble.runtime import notes
 from pebble.runtime.notes import Held, Wanted
 from tests.launcher.conftest import CONNECTION, DEVICE, Launch, Robot, Row
-from tests.support import gone, refused, until
+from tests.support import WAIT_S, gone, refused, until
 
 
 def crash(policy: RestartPolicy, at: float, ran_for: float = 0.0) -> float:
@@ -178,6 +178,7 @@ def test_systemd_is_told_also_at_an_abstract_address() -> None:
     name = f"pebble-{os.getpid()}"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(f"\0{name}")
+        systemd.settimeout(WAIT_S)
         SystemdNotifier({"NOTIFY_SOCKET": f"@{name}"}).ready()
         assert systemd.recv(64) == b"READY=1"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -147,7 +148,12 @@ def listed(theirs: Path) -> Path:
     """A folder of root's whose access control list lets nobody write: as setfacl -m u:nobody:rwx makes it."""
     entries = ((1, 7, -1), (2, 7, NOBODY), (4, 5, -1), (16, 7, -1), (32, 5, -1))  # user, one user, group, most, others
     packed = b"".join(struct.pack("<HHi", *entry) for entry in entries)
-    os.setxattr(theirs.parent / "roots", "system.posix_acl_access", struct.pack("<I", 2) + packed)
+    try:
+        os.setxattr(theirs.parent / "roots", "system.posix_acl_access", struct.pack("<I", 2) + packed)
+    except OSError as error:
+        if error.errno != errno.ENOTSUP:
+            raise
+        pytest.skip("this file system has no access control lists")
     return theirs.parent / "roots" / "new"
 
 

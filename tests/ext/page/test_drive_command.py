@@ -136,12 +136,16 @@ def test_an_emergency_stop_latches(drive: Drive, lamp: RecordingRobot, run: Run,
     driving(console, lamp)
 
 
-def test_an_emergency_stop_is_sent_on_after_the_terminal_has_ended(drive: Drive, lamp: RecordingRobot) -> None:
+@pytest.mark.parametrize("deaf", [False, True])
+def test_an_emergency_stop_is_sent_on_after_the_terminal_has_ended(
+    drive: Drive, lamp: RecordingRobot, deaf: bool
+) -> None:
     console = drive()
+    lamp.deaf = deaf
     console.type(b"!\x04")
-    assert console.process.wait(WAIT_S) == 0
-    assert lamp.latched
-    assert "NOT CONFIRMED" not in console.shown.rpartition("\n")[2]
+    assert console.process.wait(WAIT_S) == int(deaf)
+    assert lamp.latched is not deaf
+    assert console.sees(f"the emergency stop of {lamp.id} is NOT CONFIRMED", 1) is deaf
 
 
 def test_without_a_terminal_there_is_one_line(run: Run) -> None:

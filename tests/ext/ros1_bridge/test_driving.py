@@ -14,6 +14,7 @@ import pytest
 from pebble.config import Config
 from pebble.contract.payloads import Drive
 from pebble.motors.state_file import StateFile
+from pebble.services.ros1_bridge import cmd_vel
 from pebble.services.ros1_bridge.cmd_vel import CmdVel
 from pebble.services.ros1_bridge.config import Ros1
 from pebble.services.ros1_bridge.messages import GOAL_ID, GOAL_STATUS, TWIST
@@ -124,7 +125,9 @@ def test_a_stopped_base_gets_zeros_the_lock_and_no_goal_also_after_a_restart(hus
     assert husky.is_obeyed()
 
 
-def test_a_new_base_hears_a_zero_first_and_a_lock_while_it_is_stopped(husky: Husky) -> None:
+def test_a_new_base_hears_a_zero_first_and_a_lock_while_it_is_stopped(
+    husky: Husky, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Rule 3, while it is driven; then rule 4, with a bridge that is killed before the lock is open."""
     done = threading.Event()
     driver = threading.Thread(target=lambda: [husky.drive(0.2) for _ in iter(done.is_set, True)])
@@ -143,9 +146,11 @@ def test_a_new_base_hears_a_zero_first_and_a_lock_while_it_is_stopped(husky: Hus
     assert until(lambda: husky.ros.locks(up))
     assert set(husky.ros.locks(up)) == {"True"}
     husky.ros.kill("base", signal.SIGSTOP)  # its system takes what is sent to it
-    husky.reset()
-    husky.ros.kill("base")
-    husky.end()
+    with monkeypatch.context() as busy:
+        busy.setattr(cmd_vel, "_SURE_S", WAIT_S)
+        husky.reset()
+        husky.ros.kill("base")
+        husky.end()
     husky.start()
     up = husky.ros.start_base()
     assert until(lambda: husky.ros.locks(up)), "an earlier life has locked it"

@@ -284,7 +284,7 @@ def command(broker: Broker) -> Iterator[None]:
         yield
     finally:
         process.terminate()
-        process.wait(WAIT_S)
+        assert process.wait(WAIT_S) == 0
 
 
 @contextmanager

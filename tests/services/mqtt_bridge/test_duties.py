@@ -6,7 +6,7 @@ import json
 import logging
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from pebble.services.mqtt_bridge.vouching import Vouching
 from pebble.transports import Answer, Transport
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.services.mqtt_bridge.bridge_rig import Client, MemoryRig
-from tests.support import Clock, until
+from tests.support import WAIT_S, Clock, until
 
 START_S, PERIOD_S = 100.0, 0.5
 
@@ -127,16 +127,26 @@ def test_motor_owners(seconds: str, reports: list[bool]) -> None:
 
 
 PYTHON = (sys.executable, "-c")
+PULL = Row(GIT_PULL, "", 0.0)
 
 
 @pytest.fixture
-def make(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> Callable[..., Action]:
+def make(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> Iterator[Callable[..., Action]]:
+    """Make actions, and end the threads that look after their output."""
     caplog.set_level(logging.DEBUG)
+    actions = list[Action]()
 
-    def action(*words: str, **options: Any) -> Action:
-        return Action(Row(GIT_PULL, "", 0.0), SystemControl(command=words, **options), folder=tmp_path, clock=Clock())
+    def action(*words: str, row: Row = PULL, clock: Clock | None = None, **options: Any) -> Action:
+        control = SystemControl(command=words, **options)
+        actions.append(Action(row, control, folder=tmp_path, clock=clock or Clock()))
+        return actions[-1]
 
-    return action
+    yield action
+    for made in actions:
+        made._process = None
+    for thread in threading.enumerate():
+        if thread.name.startswith("action "):
+            thread.join(WAIT_S)
 
 
 def finished(action: Action) -> bool:
@@ -152,11 +162,11 @@ def test_the_table_has_a_row_for_every_action_of_the_contract_with_its_cooldown(
 
 
 def test_a_cooldown_begins_with_the_first_run_and_not_with_the_machine(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    make: Callable[..., Action], caplog: pytest.LogCaptureFixture
 ) -> None:
     clock = Clock()
     clock.now = 0.0
-    action = Action(Row(REBOOT, "", 30.0), SystemControl(command=(*PYTHON, "pass")), folder=tmp_path, clock=clock)
+    action = make(*PYTHON, "pass", row=Row(REBOOT, "", 30.0), clock=clock)
     assert finished(action)
     clock.now = 29.9
     assert not action.request()
@@ -213,7 +223,7 @@ def test_runs_also_where_no_file_can_be_written(tmp_path: Path, caplog: pytest.L
     caplog.set_level(logging.INFO)
     (tmp_path / "state").touch()  # a file where the folder is expected
     words = SystemControl(command=(*PYTHON, "print('done')"))
-    assert Action(Row(GIT_PULL, "", 0.0), words, folder=tmp_path / "state", clock=Clock()).request()
+    assert Action(PULL, words, folder=tmp_path / "state", clock=Clock()).request()
     assert until(lambda: "git-pull ended with exit code 0, its output is lost: File exists: " in caplog.text)
 
 

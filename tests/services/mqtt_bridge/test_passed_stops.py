@@ -209,6 +209,7 @@ def test_one_of_the_robots_own_side_is_repeated_too(one: bool, monkeypatch: pyte
     world.local.publish(STOP, b"{}")
     world.run(1.9)
     first, *repeated = [codec.decode(ESTOP, raw) for raw in world.local.payloads(STOP) if raw != b"{}"]
+    assert len(repeated) >= 2
     assert {(stop.stop, stop.owner) for stop in (first, *repeated)} == {(first.stop, "serial")}
     state = replace_state(FREE, latched=True, count=1, recent=[first.stop])
     world.local.publish(ESTOP_STATE.topic("", owner="serial")[1:], codec.encode(ESTOP_STATE, state), retain=True)

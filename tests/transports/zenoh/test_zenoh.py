@@ -324,7 +324,10 @@ def test_only_certificates_with_an_allowed_name_get_through(tmp_path: Path) -> N
         assert until(lambda: guest.publish("drive", b"guest", qos=DELIVERED) and b"guest" in received.payloads)
         robot.publish("state", b"robot", qos=DELIVERED, retain=True)
         assert until(
-            lambda: b"robot" in received.payloads and [one.payload for one in hub.store.retained()] == [b"robot"]
+            lambda: (
+                b"robot" in received.payloads
+                and [(one.key, one.payload) for one in hub.store.retained()] == [("state", b"robot")]
+            )
         )
         assert (overheard, b"stranger" in received.payloads) == ([], False)
 
@@ -431,7 +434,7 @@ def test_a_hello_of_a_client_that_is_gone_leaves_a_will(tmp_path: Path, monkeypa
         session: zenoh.Session = client.session  # type: ignore[attr-defined]
         session.liveliness().declare_token(wire.LIVE + "gone").undeclare()
         assert wire.ask(session, wire.HELLO, wire.encode(hello), 5.0) is not None
-        assert until(lambda: [one.payload for one in hub.store.retained()] == [b"gone"])
+        assert until(lambda: [(one.key, one.payload) for one in hub.store.retained()] == [("status", b"gone")])
 
 
 def test_nonsense_does_not_disturb_the_hub(robot: ZenohNet) -> None:

@@ -337,6 +337,11 @@ def test_a_gateway_that_cannot_work_is_refused(tmp_path: Path, settings: dict[st
     assert complaint in str(refused.value)
 
 
+def test_a_refused_gateway_is_a_complaint_and_exit_code_1(run: Run, tmp_path: Path) -> None:
+    assert run("fleet", "gateway", settings_in(tmp_path, "gate.json", hub=HUB)) == 1
+    assert "gate.json: id: is missing" in run.err
+
+
 def test_a_hub_names_where_it_listens(tmp_path: Path) -> None:
     settings = {"run_dir": str(tmp_path / "a"), "listen": [f"tcp/127.0.0.1:{free_port()}"], "journal": "a.journal"}
     with running("fleet", "hub", settings_in(tmp_path, "a.json", **settings)):

@@ -11,6 +11,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
@@ -24,7 +25,7 @@ from tests.ext.page.served import Served
 from tests.fakes.bad_brokers import BEHAVIOURS, resolving, serving
 from tests.kit.played_robot import RecordingRobot
 from tests.sparing_broker import SparingBroker
-from tests.support import WAIT_S, Broker, until
+from tests.support import WAIT_S, Broker, free_port, quickly, until
 from tests.tcp_proxy import TcpProxy
 
 _numbers = itertools.count(1)
@@ -130,13 +131,35 @@ def test_a_stop_and_a_reset_say_whether_they_reach_the_motors(
     assert codes == MOTORS[state]
 
 
+def test_a_robot_that_has_just_started_may_say_a_little_later_that_it_reaches_its_motors(
+    run: Run, robot_on: Make, url: str
+) -> None:
+    robot = robot_on("serial")
+    status = partial(robot.publish, "status", retain=True)
+    status({"value": {"driveable": {"state": "no", "why": "starting"}}})
+
+    def drive_later() -> None:
+        until(lambda: robot.latched)
+        time.sleep(0.5)
+        status({"value": {"driveable": {"state": "yes"}}})
+
+    with ThreadPoolExecutor() as pool:
+        later = pool.submit(drive_later)
+        code = run("estop", robot.id, url)
+        later.result()
+    assert (code, "stopped and confirmed after" in run.out.splitlines()[-1]) == (0, True), run.out
+
+
 def test_a_robot_that_does_not_answer_is_reported_and_ctrl_c_ends_it(robot_on: Make, url: str) -> None:
     """Under nohup a hangup does not."""
     robot = robot_on("serial")
     robot.deaf = True
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    with running("estop", robot.id, url) as process:
-        signal.signal(signal.SIGHUP, before)
+    with ExitStack() as opened:
+        before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        try:
+            process = opened.enter_context(running("estop", robot.id, url))
+        finally:
+            signal.signal(signal.SIGHUP, before)
         assert process.stdout is not None
         assert process.stdout.readline() == f"{robot.id}: stop sent\n"
         assert "not confirmed yet: serial has not confirmed" in process.stdout.readline()
@@ -213,36 +236,56 @@ def test_a_hold_stops_robots_that_come_online_later(robot_on: Make, url: str) ->
     assert f"{late.id}: was stopped, and reset since" in out
 
 
-def await_stop(process: subprocess.Popen[str], broker: Broker, robot: RecordingRobot) -> None:
-    """Start the broker once the command says that it waits, and await the confirmation."""
+@pytest.fixture
+def brittle(tmp_path: Path) -> Iterator[Broker]:
+    """A broker that a test may kill."""
+    broker = Broker(tmp_path)
+    yield broker
+    broker.stop()
+
+
+def await_outage(process: subprocess.Popen[str]) -> None:
     assert process.stderr is not None
     assert process.stderr.readline().startswith("pebble: warning: nothing is sent until there is a connection: ")
+
+
+def await_stop(process: subprocess.Popen[str], broker: Broker, robot: RecordingRobot) -> None:
+    """Start the broker once the command says that it waits, and await the confirmation."""
+    await_outage(process)
     robot.deaf = False
     broker.start()
     out, _ = process.communicate(timeout=50)
-    robot.close()
-    broker.stop()
     assert process.returncode == 0, out
     assert robot.latched
 
 
-def test_a_lost_broker_is_waited_for(tmp_path: Path) -> None:
-    broker = Broker(tmp_path)
-    robot = RecordingRobot(broker.port, "pebble/robots/lost", heartbeats=False)
-    robot.publish_states()
-    robot.deaf = True
-    with running("estop", robot.id, f"--url=mqtt://127.0.0.1:{broker.port}") as process:
-        assert until(lambda: robot.count("estop") >= 1)
-        broker.kill()
-        await_stop(process, broker, robot)
+def test_a_lost_broker_is_waited_for(brittle: Broker) -> None:
+    with RecordingRobot(brittle.port, "pebble/robots/lost", heartbeats=False) as robot:
+        robot.publish_states()
+        robot.deaf = True
+        with running("estop", robot.id, f"--url=mqtt://127.0.0.1:{brittle.port}") as process:
+            assert until(lambda: robot.count("estop") >= 1)
+            brittle.kill()
+            await_stop(process, brittle, robot)
 
 
-def test_a_broker_that_restarts_is_waited_for(tmp_path: Path) -> None:
-    broker = Broker(tmp_path)
-    robot = RecordingRobot(broker.port, "pebble/robots/lost", heartbeats=False)
-    broker.kill()
-    with running("estop", robot.id, f"--url=mqtt://127.0.0.1:{broker.port}") as process:
-        await_stop(process, broker, robot)
+def test_a_broker_that_restarts_is_waited_for(brittle: Broker) -> None:
+    with RecordingRobot(brittle.port, "pebble/robots/lost", heartbeats=False) as robot:
+        brittle.kill()
+        with running("estop", robot.id, f"--url=mqtt://127.0.0.1:{brittle.port}") as process:
+            await_stop(process, brittle, robot)
+
+
+def test_without_a_broker_nothing_is_sent_and_that_is_said(run: Run) -> None:
+    nowhere = f"--url=mqtt://127.0.0.1:{free_port()}"
+    with quickly(WAIT_S):  # half the time for which a stop is repeated
+        assert run("estop", "--all", nowhere) == 1
+    assert run.err.startswith("pebble: cannot connect to ")
+    with running("estop", "goob", nowhere) as process:
+        await_outage(process)
+        process.send_signal(signal.SIGINT)
+        out, _ = process.communicate(timeout=WAIT_S)
+    assert (process.returncode, out) == (1, "goob: STOP NOT SENT: there was no connection\n")
 
 
 #: What a broker keeps, too long to arrive, of a stranger or of the robot itself, and who stops the robot all the same.
