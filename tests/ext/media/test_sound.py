@@ -81,6 +81,7 @@ def test_pcm_is_exact_whatever_the_pieces(feed: int, channels: int) -> None:
     sounds = received(packets("pcm", recorded, 16000, feed=feed))
     assert [len(one.samples) for one in sounds] == [320] * 25
     assert np.array_equal(joined(sounds), recorded)
+    assert b"".join(one.pcm for one in sounds) == recorded.tobytes()
     assert [one.sequence for one in sounds] == list(range(1, 26))
     assert all(abs(one.captured_ms - (1000 + 20 * number)) <= 1 for number, one in enumerate(sounds))
 

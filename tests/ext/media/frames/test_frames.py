@@ -169,8 +169,8 @@ def test_there_is_one_writer_at_a_time(tmp_path: Path) -> None:
             FrameWriter(tmp_path, "camera", capacity=1000).open()
         with FrameWriter(tmp_path, "microphone", capacity=1000):
             pass
-    with FrameWriter(tmp_path, "camera", capacity=1000):
-        pass
+    with FrameWriter(tmp_path, "camera", capacity=1000) as writer:
+        assert (writer.write(b"nobody reads it", FrameInfo()), writer.counters["unwanted"]) == (False, 1)
 
 
 @pytest.fixture
