@@ -189,6 +189,9 @@ def lanes(items: Sequence[pytest.Item], processes: int) -> list[Lane]:
             groups[key] = []
             lane.modules.append(groups[key])
         groups[key].append(index)
+    longest_first = sorted(alone.modules, key=len, reverse=True)  # so that none is left for the end, by itself
+    alone.modules.clear()
+    alone.modules.extend(longest_first)
     return [computing, unmarked, alone, solo]
 
 

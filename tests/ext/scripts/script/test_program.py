@@ -132,7 +132,7 @@ def test_a_run_that_is_ended_at_the_motors(station: Station) -> None:
     station.publish_state(latched=True, count=1, by="anna")
     code, output = ended(script)
     assert code == EXIT_ENDED
-    assert output.endswith("[WARNING] emergency stop by anna\n"), output
+    assert "[WARNING] emergency stop by anna\n" in output
 
 
 @BOTH
