@@ -11,10 +11,9 @@ import jsonschema
 import pytest
 
 from pebble.extensions.checks.keys import keys_text
-from tests.support import some
+from tests.support import ROOT, some
 from tools.schema import SCHEMA_FILE, schema_text
 
-ROOT = Path(__file__).resolve().parents[2]
 SCHEMA = json.loads(schema_text())
 FILES = [
     *sorted(path for path in (ROOT / "configs").glob("*.json") if path.name != SCHEMA_FILE.name),

@@ -98,9 +98,6 @@ def analyze() -> Callable[..., subprocess.CompletedProcess[str]]:
     return run
 
 
-# -- what the units say
-
-
 @units
 def test_every_unit_confines(unit: Path) -> None:
     keys = service(unit.read_text())

@@ -185,11 +185,6 @@ def test_no_topic_is_spelled_outside_the_contract() -> None:
     assert [one for path in files if not str(path).endswith(excepted) for one in spelled_topics(path)] == []
 
 
-# -- identities
-
-GOOB = Identity("pebble", "robots", "goob")
-
-
 @pytest.mark.parametrize(
     "topic",
     [

@@ -18,7 +18,7 @@ from tests.services.mqtt_bridge.bridge_rig import BASE, Client, make_config
 from tests.support import Clock, errors
 
 LOCAL, REMOTE = Side.LOCAL, Side.REMOTE
-DRIVE, ESTOP, FLAG = "incoming/drive-values", "incoming/estop", "incoming/flags/mqtt-video"
+DRIVE, ESTOP = "incoming/drive-values", "incoming/estop"
 TOPIC = f"{BASE}/{DRIVE}"
 SUBJECTS = Subjects(make_config())
 MOVE, ZERO = b'{"z": 0.5}', b'{"z": 0}'

@@ -317,30 +317,21 @@ def forwarder(waiting: Forwarder) -> Forwarder:
     return waiting
 
 
-class TestEventBuffer:
-    @pytest.fixture
-    def events(self, remote: Wire, clock: Clock) -> EventBuffer:
-        self.counters = Counters()
-        return EventBuffer(remote, self.counters, clock=clock)
-
-    def publish(self, events: EventBuffer, number: int) -> None:
-        events.send(Message("t", b"%d" % number, QoS.DELIVERED))
-
-    def test_repeats_what_a_dying_link_may_have_swallowed(
-        self, events: EventBuffer, remote: Wire, clock: Clock
-    ) -> None:
-        self.publish(events, 1)
-        clock.now += RESEND_S
-        self.publish(events, 2)
-        clock.now += RESEND_S - 0.1
-        remote.up = False
-        events.watch(State.CONNECTING)
-        clock.now += 60
-        self.publish(events, 3)
-        remote.up = True
-        self.publish(events, 4)  # before the flush: waits its turn
-        events.flush()
-        assert remote.sent == [b"1", b"2", b"2", b"3", b"4"]
+def test_an_event_buffer_repeats_what_a_dying_link_may_have_swallowed(remote: Wire, clock: Clock) -> None:
+    events = EventBuffer(remote, Counters(), clock=clock)
+    first, second, third, fourth = (Message("t", b"%d" % number, QoS.DELIVERED) for number in range(1, 5))
+    events.send(first)
+    clock.now += RESEND_S
+    events.send(second)
+    clock.now += RESEND_S - 0.1
+    remote.up = False
+    events.watch(State.CONNECTING)
+    clock.now += 60
+    events.send(third)
+    remote.up = True
+    events.send(fourth)  # before the flush: waits its turn
+    events.flush()
+    assert remote.sent == [b"1", b"2", b"2", b"3", b"4"]
 
 
 class TestGate:

@@ -46,7 +46,6 @@ def forward(qos: int = 1, *, retain: bool = False, urgent: bool = False) -> Forw
 COMMAND = forward(urgent=True)
 DRIVE = Forward(QoS.DELIVERED, retain=False, urgent=True, unsigned=True, stamped=True)  # from outside
 FLAG = forward(retain=True, urgent=True)
-ACTION = forward(urgent=True)
 
 FLAGS = ("incoming/flags/remote-mirror", "incoming/flags/mqtt-audio", "incoming/flags/mqtt-video")
 ACTIONS = ("incoming/flags/reboot", "incoming/flags/service-restart", "incoming/flags/git-pull")
@@ -71,10 +70,9 @@ A1: list[Row] = [
     (LOCAL, ("outgoing/sensors/imu-fast",), {"qos": 0}, Drop.STAYS),
     (LOCAL, ("outgoing/front-camera", "outgoing/audio"), {"qos": 0}, Drop.MEDIA),
     # 2: incoming/# is always forwarded to local, except incoming/audio-stream
-    (REMOTE, COMMANDS[1:], {}, COMMAND),
+    (REMOTE, (*COMMANDS[1:], *ACTIONS), {}, COMMAND),
     *((REMOTE, COMMANDS[:1], how, DRIVE) for how in ({}, {"qos": 0}, HIDDEN)),
     (REMOTE, STRANGE, {"qos": 0}, forward(0, urgent=True)),
-    (REMOTE, ACTIONS, {}, ACTION),
     *((REMOTE, FLAGS, how, FLAG) for how in ({}, REQUESTED, HIDDEN, RETAINED)),
     *((REMOTE, NIGHT, how, FLAG) for how in (REQUESTED, RETAINED)),
     (REMOTE, NIGHT, {}, forward(urgent=True)),
@@ -83,7 +81,7 @@ A1: list[Row] = [
     *((REMOTE, (*OUT, "outgoing/online", "outgoing/logs"), how, Drop.ONE_WAY) for how in ({}, RETAINED)),
     # 4: incoming/flags/# is always mirrored to remote
     (LOCAL, FLAGS, {}, FLAG),
-    (LOCAL, ACTIONS, {}, ACTION),
+    (LOCAL, ACTIONS, {}, COMMAND),
     (LOCAL, NIGHT, REQUESTED, FLAG),
     # What happens once is never forwarded if it is retained, or was published to be retained
     *((side, (*COMMANDS, *ACTIONS), how, Drop.STALE) for side in Side for how in (RETAINED, REQUESTED)),
@@ -92,8 +90,7 @@ A1: list[Row] = [
 ON_THE_ROBOT: list[Row] = [
     *((side, ("outgoing/status",), REQUESTED, forward(retain=True)) for side in Side),
     *((side, ("outgoing/sensors/imu-fast", "outgoing/strange"), {"qos": 0}, forward(0)) for side in Side),
-    *((side, COMMANDS, {}, COMMAND) for side in Side),
-    *((side, ACTIONS, {}, ACTION) for side in Side),
+    *((side, (*COMMANDS, *ACTIONS), {}, COMMAND) for side in Side),
     *((side, FLAGS, {}, FLAG) for side in Side),
     *((side, ("outgoing/front-camera", "outgoing/audio", "incoming/audio-stream"), {}, Drop.MEDIA) for side in Side),
     *((side, (*COMMANDS, *ACTIONS), how, Drop.STALE) for side in Side for how in (RETAINED, REQUESTED)),
@@ -132,7 +129,7 @@ def test_other_topics_never_pass(topic: str, rules: Rules) -> None:
 
 
 RENAMED = {
-    "services.mqtt_bridge.topics.reboot": (ACTION, LOCAL),
+    "services.mqtt_bridge.topics.reboot": (COMMAND, LOCAL),
     "services.mqtt_bridge.topics.mqtt_audio": (FLAG, REMOTE),
     "services.serial_mcu_bridge.topics.drive_values": (DRIVE, REMOTE),
     "services.serial_mcu_bridge.topics.high_rate": (Drop.STAYS, LOCAL),

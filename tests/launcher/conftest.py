@@ -19,7 +19,7 @@ from tests.support import ROOT, WAIT_S, gone, process_name, until
 
 BASE = "pebble/robots/rover"
 FAKES = ROOT / "tests" / "fakes"
-LOCAL_TRANSPORT, ANNOUNCER, DEVICE, CONNECTION = (int(stage) for stage in Stage)
+LOCAL_TRANSPORT, _, DEVICE, CONNECTION = (int(stage) for stage in Stage)
 
 Row = tuple[Any, ...]  # name, behaviour, stage; perhaps a dict of more that a program is
 

@@ -7,6 +7,7 @@ import logging
 import os
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import pytest
 from pebble.contract.payloads import LogRecord
 from pebble.launcher import log_forwarding
 from pebble.launcher.announcer import Announcer
-from pebble.launcher.announcer_pipe import ENVELOPE_LIMIT, AnnouncerPipe, Envelope, next_envelope
+from pebble.launcher.announcer_pipe import ENVELOPE_LIMIT, AnnouncerPipe, next_envelope
 from pebble.launcher.log_forwarding import LevelReader, LogForwarder, NonBlockingWriter, OwnRecords, text_of
 from pebble.launcher.reactor import Reactor
 from pebble.runtime.parent import Notifier
@@ -109,8 +110,6 @@ def test_a_failure_to_publish_does_not_end_it(
     assert until(lambda: connected.sent("logs") == [3])
 
 
-# -- the pipe between launcher and announcer
-
 WILL = Message("status", b"gone", QoS.DELIVERED, retain=True)
 
 
@@ -132,18 +131,13 @@ class Connection:
             os.close(self._announcer)
             self._announcer = None
 
-    def next(self) -> Envelope | None:
-        assert self._announcer is not None
-        return next_envelope(self._announcer)
-
     def received(self) -> list[tuple[str, bytes]]:
         """Kind and payload of every envelope in the pipe."""
+        assert self._announcer is not None
         envelopes = []
-        try:
-            while (envelope := self.next()) is not None:
+        with suppress(BlockingIOError):
+            while (envelope := next_envelope(self._announcer)) is not None:
                 envelopes.append((envelope.kind, envelope.message.payload))
-        except BlockingIOError:
-            pass
         return envelopes
 
     def fill(self) -> int:
@@ -311,9 +305,6 @@ def test_writing_never_waits_for_a_reader() -> None:
         assert writer.dropped == dropped + 1
     finally:
         os.close(write_end)
-
-
-# -- levels
 
 
 @pytest.mark.parametrize(

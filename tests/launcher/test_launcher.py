@@ -22,8 +22,6 @@ from tests.fakes.seccomp import CALLS
 from tests.launcher.conftest import BASE, CONNECTION, DEVICE, LOCAL_TRANSPORT, Launch, lines_of
 from tests.support import ROOT, WAIT_S, gone, until
 
-# -- starting
-
 
 def test_children_start_in_order_and_stop_one_stage_after_the_other_and_nothing_is_left(launch: Launch) -> None:
     stages = {"hub": LOCAL_TRANSPORT, "serial": DEVICE, "bridge": CONNECTION}
@@ -58,9 +56,6 @@ def test_a_stop_signal_while_starting_starts_no_further_child(launch: Launch) ->
     robot = launch(("hub", "good", LOCAL_TRANSPORT), ("serial", "good", DEVICE), options=("signal",))
     assert robot.process.wait(WAIT_S) == 0
     assert robot.stderr().count("spawned a child") == 1
-
-
-# -- keeping alive
 
 
 def test_a_killed_child_is_started_again_at_once_with_the_config_of_its_launcher(launch: Launch) -> None:
@@ -163,9 +158,6 @@ def test_supervision_does_not_wait_for_a_transport(launch: Launch, trouble: str)
     assert len(robot.events("serial", "stop")) == 1
 
 
-# -- a forked process
-
-
 def test_a_child_finds_what_a_fresh_interpreter_would_and_has_a_name(launch: Launch) -> None:
     robot = launch(("serial_mcu_bridge:arm", "curious", DEVICE))
     assert robot.ready("serial_mcu_bridge:arm", "announcer")
@@ -207,9 +199,6 @@ def test_restarts_leave_no_descriptors_behind(launch: Launch) -> None:
     assert until(lambda: len(list(open_now.iterdir())) <= before + 4), "one child's, at most, come and go"
 
 
-# -- stopping
-
-
 def test_a_program_that_does_not_stop_is_killed_and_takes_no_time_from_others(launch: Launch) -> None:
     robot = launch(
         ("hub", "good", LOCAL_TRANSPORT),
@@ -248,9 +237,6 @@ def test_a_program_that_ends_while_the_robot_stops_is_not_started_again(launch: 
     assert len(robot.events("hub", "start")) == 1
 
 
-# -- telling
-
-
 def test_systemd_is_notified_of_readiness_life_and_end(launch: Launch) -> None:
     address = f"@pebble-test-{os.getpid()}"  # an abstract one
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
@@ -280,8 +266,6 @@ def test_systemd_is_notified_of_readiness_life_and_end(launch: Launch) -> None:
         assert notified("STOPPING=1")
         assert not robot.published("logs"), "they are switched off"
 
-
-# -- the table
 
 ON, OFF = {"enabled": True}, {"enabled": False}
 UPLINK = {"enabled": True, "remote_mqtt": {"host": "far"}}

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import stat
 import subprocess
-import sys
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack, closing
@@ -28,7 +26,7 @@ from pebble.runtime.connections import hub_settings, local_settings, mqtt_settin
 from pebble.runtime.environment import child_environment, withhold
 from pebble.runtime.hub import WILLS
 from pebble.runtime.whole_file import write
-from pebble.transports import MqttSettings, QoS, ZenohSettings, create
+from pebble.transports import Message, MqttSettings, QoS, ZenohSettings, create
 from pebble.transports.hosts import SMALL_SEGMENT
 from pebble.transports.topics import matches
 from pebble.transports.zenoh import wire
@@ -38,7 +36,8 @@ from pebble.transports.zenoh.hub.journal import Journal
 from pebble.transports.zenoh.hub.records import StoredWill
 from pebble.transports.zenoh.wire import Will
 from tests.sparing_broker import SparingBroker
-from tests.support import ROOT, WAIT_S, Broker, Child, refused, until
+from tests.support import Broker, refused, until
+from tests.transports.net import ProcessPeer
 from tests.transports.zenoh_net import HubProcess
 
 BASE = "pebble/robots/goob"
@@ -166,17 +165,6 @@ TAKEN = (
     *(f"{BASE}/incoming/flags/{flag}" for flag in ("mqtt-video", "night", "reboot/now")),
     *("site/video", "will", f"a/{BASE}/incoming/drive-values"),
 )
-VICTIM = """
-import json, sys, time; from pathlib import Path
-from pebble.transports import Message, QoS, ZenohSettings, create
-run_dir, *topics = json.loads(sys.argv[1])
-clients = [
-    create("zenoh", topic, ZenohSettings(run_dir=Path(run_dir), client=True), will=Message(topic, b'{"z":0.6}', QoS(1)))
-    for topic in topics
-]
-print([client.open(10).state.name for client in clients], flush=True)
-time.sleep(600)
-"""
 
 
 @pytest.fixture
@@ -194,13 +182,10 @@ def settings(tmp_path: Path) -> ZenohSettings:
 
 def die(settings: ZenohSettings, *topics: str) -> None:
     """Be killed as clients that have left a will on each of ``topics``."""
-    arguments = [sys.executable, "-c", VICTIM, json.dumps([str(settings.run_dir), *topics])]
-    victim = Child(arguments, cwd=ROOT, stdout=subprocess.PIPE, text=True)
-    assert victim.stdout is not None
-    assert victim.stdout.readline().count("CONNECTED") == len(topics), "a hello succeeds, whatever the will"
-    victim.kill()
-    victim.wait(WAIT_S)
-    victim.stdout.close()
+    client = ZenohSettings(run_dir=settings.run_dir, client=True)
+    left = [Message(topic, b'{"z":0.6}', QoS.DELIVERED) for topic in topics]
+    for victim in [ProcessPeer("zenoh", message.topic, client, message) for message in left]:
+        victim.kill()  # it was connected: a hello succeeds, whatever the will
 
 
 def test_by_topic(settings: ZenohSettings) -> None:

@@ -243,7 +243,6 @@ def test_long_lines_cost_no_memory(truncate: bool, chunks: list[bytes], lines: l
 
 
 LONGEST, RATE = 3500, 10.0  # 20 at once
-_own = re.compile(rb"\d\d:\d\d:\d\d \[(WARNING|INFO)\] (.*)").fullmatch
 
 
 class Log(BoundedOutput):
@@ -253,7 +252,7 @@ class Log(BoundedOutput):
         super().__init__(self._take, LONGEST, 0.0, rate=RATE)
 
     def _take(self, line: bytes) -> None:
-        own = _own(line)
+        own = re.fullmatch(rb"\d\d:\d\d:\d\d \[(WARNING|INFO)\] (.*)", line)
         if own:
             self.said.append(own[2].decode())
         else:
@@ -267,10 +266,6 @@ def log() -> Log:
 
 def numbers(count: int, begin: int = 0) -> bytes:
     return b"".join(b"line %d\n" % number for number in range(begin, begin + count))
-
-
-def left_out(count: int) -> str:
-    return f"{count} lines are left out: 10 a second are logged"
 
 
 def test_chunks_become_lines_and_long_ones_are_cut(log: Log) -> None:
@@ -288,7 +283,7 @@ def test_a_flood_is_cut_and_counted_and_its_last_words_are_kept(log: Log) -> Non
     log.tick(0.5)
     assert log.said == []
     log.tick(1.2)
-    assert log.said == [left_out(10_000 - 20 - KEPT)]
+    assert log.said == [f"{10_000 - 20 - KEPT} lines are left out: 10 a second are logged"]
     assert log.lines[-2:] == [b"line 9998", b"line 9999"]
     log.feed(b"after\n", 3.0)
     assert (log.lines[-1], log.flooded, log.waits) == (b"after", False, False)

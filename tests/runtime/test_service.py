@@ -174,9 +174,6 @@ def running(robot: Robot) -> Robot:
     return robot
 
 
-# -- life
-
-
 def test_a_message_that_a_handler_fails_on_is_counted_and_ends_nothing(caplog: pytest.LogCaptureFixture) -> None:
     class Fragile(Recorder):
         def note(self, value: Any) -> None:
@@ -322,9 +319,6 @@ def test_work_of_another_thread_that_fails_ends_the_service_and_not_that_thread(
     assert not idle.service.run_if_idle(lambda: None), "it has ended"
 
 
-# -- receiving
-
-
 def test_of_several_waiting_drive_commands_only_the_newest_is_handled(running: Robot) -> None:
     running.keep_busy(DRIVE_TOPIC, '{"x": 0.01}', 0.01)
     for number in range(1, 100):
@@ -398,9 +392,6 @@ def test_a_malformed_message_is_counted_logged_once_and_replaces_nothing(
     running.publish(REBOOT_TOPIC, " \t\n" * 8)  # by such payloads bridges look for cycles
     assert until(lambda: running.service.counters["blank"] == 1)
     assert running.service.counters["refused"] == 100
-
-
-# -- publishing
 
 
 def test_the_handler_of_a_pattern_receives_the_names_in_the_topic(running: Robot) -> None:

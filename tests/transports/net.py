@@ -50,10 +50,8 @@ class Net(ABC):
     @abstractmethod
     def thaw_network(self) -> None: ...
 
-    def echoless_settings(self) -> Any:
-        """Settings of a client whose `echo=False` is exact (T16)."""
-        return self.settings()
-
+    #: Changes to settings of a client whose `echo=False` is exact (T16).
+    echoless: ClassVar[dict[str, Any]] = {}
     #: Changes to settings of a client that is not to count the network as silent while this machine is busy.
     patient: ClassVar[dict[str, Any]] = {}
 
@@ -69,10 +67,12 @@ class Net(ABC):
 
     def client(self, name: str, *, will: Message | None = None, opened: bool = True, **changes: Any) -> Transport:
         """A client in this process; `opened` waits for the connection and fails the test without one."""
-        return self._client(name, self.settings(**changes), will, opened)
-
-    def echoless_client(self, name: str) -> Transport:
-        return self._client(name, self.echoless_settings(), None, True)
+        client = create(self.kind, name, self.settings(**changes), will=will)
+        self._clients.append(client)
+        if opened:
+            client.open(WAIT_S)
+            assert client.state is State.CONNECTED, client.problem
+        return client
 
     def peer(self, name: str, *, will: Message | None = None) -> Any:
         """A connected client that can be killed: in its own process where the network is real."""
@@ -97,14 +97,6 @@ class Net(ABC):
         """End everything, the network included."""
         self.close_clients()
         self.stop_network()
-
-    def _client(self, name: str, settings: Any, will: Message | None, opened: bool) -> Transport:
-        client = create(self.kind, name, settings, will=will)
-        self._clients.append(client)
-        if opened:
-            client.open(WAIT_S)
-            assert client.state is State.CONNECTED, client.problem
-        return client
 
 
 class ProcessPeer:
@@ -249,6 +241,7 @@ class MemoryPeer:
 
 class MqttNet(Net):
     kind = "mqtt"
+    echoless: ClassVar[dict[str, Any]] = {"as_published": True}
     patient: ClassVar[dict[str, Any]] = {"silence_s": 20.0}
 
     def __init__(self, folder: Path, protocol: str) -> None:
@@ -259,9 +252,6 @@ class MqttNet(Net):
     def settings(self, **changes: Any) -> Any:
         settings = {"host": "127.0.0.1", "port": self._broker.port, "protocol": self._protocol, **changes}
         return MqttSettings(**settings)
-
-    def echoless_settings(self) -> Any:
-        return self.settings(as_published=True)
 
     def start_network(self) -> None:
         if not self._broker.running:

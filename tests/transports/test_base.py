@@ -108,17 +108,14 @@ class TestQueue:
 
 
 class TestTable:
-    def made(self, topics: int = 10, size: int = 100) -> BoundedTable[bytes]:
-        return BoundedTable(topics, size, len)
-
     def test_forgets_the_oldest_beyond_its_number(self) -> None:
-        table = self.made(topics=2)
+        table: BoundedTable[bytes] = BoundedTable(2, 100, len)
         for topic in ("a", "b", "a", "c"):
             table[topic] = b"1"
         assert dict(table) == {"a": b"1", "c": b"1"}
 
     def test_one_that_is_too_large_leaves_the_others(self) -> None:
-        table = self.made()
+        table: BoundedTable[bytes] = BoundedTable(10, 100, len)
         table["a"] = table["b"] = b"1"
         table["a"] = bytes(100)
         assert dict(table) == {"b": b"1"}
@@ -127,7 +124,7 @@ class TestTable:
         assert len(table) == 1, "topics count"
 
     def test_what_was_removed_makes_room(self) -> None:
-        table = self.made()
+        table: BoundedTable[bytes] = BoundedTable(10, 100, len)
         table["a"] = bytes(99)
         assert not table.put_if_room("b", b"")
         assert dict(table) == {"a": bytes(99)}
@@ -200,9 +197,6 @@ def test_many_machines_take_no_memory() -> None:
     assert len(ages.clocks.clocks) <= 256
 
 
-# -- kinds
-
-
 class TheirTransport(MemoryTransport):
     """A transport as a third party's package would define it."""
 
@@ -229,7 +223,6 @@ def test_what_is_not_a_transport_is_refused(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 CERTS = ROOT / "tests" / "data" / "tls"
-EVERY_CIPHER = "ALL:@SECLEVEL=0"
 
 
 def shake_hands(ours: ssl.SSLContext, theirs: ssl.SSLContext) -> ssl.SSLObject:
@@ -247,7 +240,7 @@ def agreed(version: ssl.TLSVersion) -> str | None:
     """Return what a connection agrees on with a server that speaks only ``version``."""
     theirs = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     theirs.load_cert_chain(CERTS / "server.crt", CERTS / "server.key")
-    theirs.set_ciphers(EVERY_CIPHER)
+    theirs.set_ciphers("ALL:@SECLEVEL=0")
     theirs.minimum_version = theirs.maximum_version = version
     return shake_hands(make_context(TlsSettings(ca_cert=CERTS / "ca.crt")), theirs).version()
 

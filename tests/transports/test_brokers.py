@@ -24,7 +24,6 @@ from tests.transports.brokers import MAKERS, ROBOT, Maker
 pytestmark = [pytest.mark.alone, pytest.mark.thorough]  # deadlines are checked; make long PART=brokers runs it
 
 STOPPED = {"latched": True, "boot": "b", "count": 1, "recent": [], "by": "ann", "why": "", "since": 1}
-TRUE, FALSE = b'{"value": true}', b'{"value": false}'
 
 
 @pytest.fixture(scope="module", params=MAKERS)
@@ -48,10 +47,6 @@ def broker(running: Broker) -> Broker:
     return running
 
 
-def settings(broker: Broker, **more: Any) -> MqttSettings:
-    return MqttSettings(host="127.0.0.1", port=broker.port, **more)
-
-
 @pytest.fixture
 def base(request: pytest.FixtureRequest) -> str:
     return f"pebble/robots/{request.node.originalname.rpartition('_')[2]}"
@@ -65,7 +60,7 @@ def test_an_operators_tool_finds_the_states_of_an_idle_robot(maker: Maker, broke
     states: dict[str, Any] = {"capabilities": {"t": 1, "value": {**drives, "estop": estop}}}
     states["charging-level"] = {"value": 12.5}
     states["estop/serial"] = STOPPED
-    with MqttTransport("robot", settings(broker)) as robot:
+    with MqttTransport("robot", MqttSettings(host="127.0.0.1", port=broker.port)) as robot:
         for name, value in states.items():
             robot.publish(f"{base}/outgoing/{name}", json.dumps(value).encode(), qos=QoS.DELIVERED, retain=True)
 

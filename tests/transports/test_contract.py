@@ -21,7 +21,7 @@ from paho.mqtt.client import topic_matches_sub
 
 from pebble.errors import TransportError
 from pebble.transports import Message, QoS, State, Transport, clock
-from tests.support import ROOT, THOROUGH, WAIT_S, quickly, until
+from tests.support import ROOT, THOROUGH, WAIT_S, beside, quickly, until
 from tests.transports.net import Net, Received
 
 LATEST, DELIVERED = QoS.LATEST, QoS.DELIVERED
@@ -44,9 +44,6 @@ def reconnecting(*clients: Transport) -> Iterator[None]:
     for client in clients:
         assert until(lambda: client.counters["connected"] > before[client]), client.problem  # noqa: B023
         assert until(lambda: client.state is State.CONNECTED), client.problem  # noqa: B023
-
-
-# -- T1, T2: topics and filters
 
 
 LEVELS = ["a", "b", "", "+", "#", "$x", "*", "a b", "ü", "@", "?", "a.b"]
@@ -125,9 +122,6 @@ def test_T02_what_no_transport_may_carry_is_refused_before_anything_is_sent(net:
 def test_T02_a_will_on_a_bad_topic_is_refused(net: Net) -> None:
     with pytest.raises(TransportError):
         net.client("bad-will", will=Message("a/#", b"x"), opened=False)
-
-
-# -- T3, T4: delivery
 
 
 def test_T03_a_message_put_right_after_open_and_subscribe_arrives(net: Net, base: str) -> None:
@@ -214,9 +208,6 @@ def test_T04_a_transport_that_is_not_open_refuses(net: Net, base: str) -> None:
         client.subscribe(base, Received())
 
 
-# -- T5 to T9: retained messages
-
-
 def test_T05_a_retained_message_reaches_late_subscribers(net: Net, base: str) -> None:
     sender = net.client("sender")
     for value in (b"old", b"new"):
@@ -235,7 +226,7 @@ def test_T05_a_retained_message_outlives_its_publisher(net: Net, base: str) -> N
     for how in ("kill", "close"):
         peer = net.peer(f"publisher-{how}")
         assert peer.publish(f"{base}/{how}", b"value", retain=True)
-        peer_drained(net, peer, base)
+        drained(peer, net.client(f"watcher-{how}"), base)
         getattr(peer, how)()
     received = Received()
     net.client("late").subscribe(f"{base}/+", received)
@@ -244,16 +235,6 @@ def test_T05_a_retained_message_outlives_its_publisher(net: Net, base: str) -> N
         (f"{base}/kill", b"value", True),
         (f"{base}/close", b"value", True),
     }
-
-
-def peer_drained(net: Net, peer: object, base: str) -> None:
-    """Wait until what ``peer`` published before is stored."""
-    received = Received()
-    watcher = net.client(f"watcher-{id(peer)}")
-    watcher.subscribe(f"{base}/word/peer", received)
-    assert peer.publish(f"{base}/word/peer", b"x")  # type: ignore[attr-defined]
-    assert until(lambda: received.messages)
-    watcher.close()
 
 
 def test_T05_retained_messages_come_once_per_subscription_and_connection(net: Net, base: str) -> None:
@@ -329,9 +310,7 @@ def test_T08_the_newest_value_is_seen_last(net: Net, base: str) -> None:
                 sender.publish(f"{base}/{number}", b"%d" % rounds[0], qos=DELIVERED, retain=True)
             stop.wait(0.002)
 
-    writer = threading.Thread(target=keep_changing)
-    writer.start()
-    try:
+    with beside(keep_changing, stop):
         for turn in range(3):
             late, received = net.client(f"late{turn}"), Received()
             late.subscribe(f"{base}/+", received, limit=100_000)
@@ -341,15 +320,12 @@ def test_T08_the_newest_value_is_seen_last(net: Net, base: str) -> None:
             for message in received.messages:
                 assert newest.get(message.topic, -1) <= int(message.payload), "an older value came after a newer one"
                 newest[message.topic] = int(message.payload)
-    finally:
-        stop.set()
-        writer.join()
 
 
 def test_T09_retained_messages_survive_the_network_and_dead_clients(net: Net, base: str) -> None:
     peer = net.peer("gone")
     assert peer.publish(f"{base}/gone", b"still here", retain=True)
-    peer_drained(net, peer, base)
+    drained(peer, net.client("watcher"), base)
     peer.kill()
     net.restart_network()
     received = Received()
@@ -410,9 +386,6 @@ def test_T09_only_what_changed_during_the_outage_is_sent(net: Net, base: str) ->
         assert until(lambda: {m.topic: m.payload for m in received.messages} == wanted)
 
 
-# -- T10: wills
-
-
 def test_T10_the_will_is_spoken_once_when_a_client_is_killed(net: Net, base: str) -> None:
     received = Received()
     net.client("watcher").subscribe(f"{base}/will", received)
@@ -468,9 +441,6 @@ def test_T10_a_client_that_is_started_again_at_once_is_believed(net: Net, base: 
     assert retained.until(b"back")
 
 
-# -- T11: overlapping filters
-
-
 def test_T11_every_handler_receives_a_message_once(net: Net, base: str) -> None:
     client, sender = net.client("many-filters"), net.client("sender")
     filters = ["a/b", "a/b", "a/+", "a/#", "#", "+/b", "a/b/#", "+/+"]
@@ -496,9 +466,6 @@ def test_T11_closing_one_of_two_overlapping_subscriptions_leaves_the_other(net: 
     client.publish(f"{base}/a/b", b"x", qos=DELIVERED)
     assert narrow.until(b"x")
     assert wide.payloads == []
-
-
-# -- T12, T19: reconnecting
 
 
 def test_T12_reconnects_resubscribes_and_notifies_watchers(net: Net, base: str) -> None:
@@ -566,9 +533,6 @@ def test_T19_a_message_knows_how_long_it_has_waited_for_a_process_that_stood_sti
     go_on.set()
     assert until(lambda: len(waited) == 2)
     assert waited[0] < 0.6 <= waited[1]
-
-
-# -- T13, T14: handlers
 
 
 def test_T13_one_call_at_a_time_and_never_on_the_publishers_thread(net: Net, base: str) -> None:
@@ -661,9 +625,7 @@ def test_T13_nothing_is_delivered_once_close_returned(net: Net, base: str, direc
             sender.publish(base, b"x", qos=LATEST)
             stop.wait(0.0005)
 
-    talker = threading.Thread(target=steady)
-    talker.start()
-    try:
+    with beside(steady, stop):
         for _ in range(20):
             closed, late, received = threading.Event(), [], Received()
 
@@ -676,9 +638,6 @@ def test_T13_nothing_is_delivered_once_close_returned(net: Net, base: str, direc
             subscription.close()
             closed.set()
             assert not any(late)
-    finally:
-        stop.set()
-        talker.join()
     assert not any(late)
 
 
@@ -742,9 +701,6 @@ def test_T14_a_slow_handler_delays_only_itself(net: Net, base: str, caplog: pyte
     assert 0 < caplog.text.count("too slow") < 10
 
 
-# -- T15 to T18
-
-
 @pytest.mark.parametrize("qos", [LATEST, DELIVERED])
 def test_T15_payloads_arrive_untouched(net: Net, base: str, qos: QoS) -> None:
     sender, receiver, received = net.client("sender"), net.client("receiver"), Received()
@@ -758,7 +714,7 @@ def test_T15_payloads_arrive_untouched(net: Net, base: str, qos: QoS) -> None:
 
 
 def test_T16_own_publishes_do_not_come_back_where_that_is_promised(net: Net, base: str) -> None:
-    bridge, other = net.echoless_client("bridge"), net.client("other")
+    bridge, other = net.client("bridge", **net.echoless), net.client("other")
     assert bridge.exact_echo
     received, elsewhere = Received(), Received()
     bridge.publish(f"{base}/kept-before", b"own", qos=DELIVERED, retain=True)
