@@ -194,7 +194,6 @@ def test_its_manifest_is_that_of_the_original_but_for_the_board() -> None:
 
 
 KINDS = ("goob", "fred")
-STARTS = {"goob": 2, "fred": 4}  # pins of motors that come first: Goob's headlights take a timer channel between them
 
 
 @pytest.fixture(params=KINDS)
@@ -221,7 +220,8 @@ def test_the_motors_come_first(kind: str) -> None:
     bench = Bench(kind, change=note)
     motor_pins = {*bench.body.pins.LEFT, *bench.body.pins.RIGHT}
     pins = list(dict.fromkeys(pin for _, pin in touched))
-    assert pins.index(next(pin for pin in pins if pin not in motor_pins)) == STARTS[kind]
+    first = pins.index(next(pin for pin in pins if pin not in motor_pins))
+    assert first == {"goob": 2, "fred": 4}[kind], "Goob's headlights take a timer channel between them"
     assert all(bench.board.duty(pin) == 0.0 for pin in motor_pins)
     assert "ADC" not in [name for name, _ in touched[:4]]
 
@@ -330,14 +330,13 @@ class Endless(Bench):
             self.board.timers.on_wait = self._check
         firmware = self.board.firmware
         with pytest.raises(SwitchedOff):
-            firmware.run(f"{self.kind}/main.py") if main else firmware.module("common.run").run(self._built, {})
+            firmware.run(f"{self.kind}/main.py") if main else firmware.module("common.run").run(
+                lambda _: self.robot, {}
+            )
 
     def lines(self, pattern: bytes) -> list[float]:
         """The times of output lines like this."""
         return [when for when, data in self.output for line in data.splitlines() if re.fullmatch(pattern, line)]
-
-    def _built(self, _settings: object) -> Any:
-        return self.robot
 
     def _check(self) -> None:
         now = self.clock.now()

@@ -154,9 +154,7 @@ def grabbed(source: Source) -> tuple[FrameInfo, np.ndarray]:
     return capture.info, capture.pixels(np.empty(capture.size, np.uint8)).copy()
 
 
-@cache
-def _speech() -> Speech:
-    return Speech(16_000)
+speech_of = cache(Speech)
 
 
 def is_speech(chunks: Sequence[tuple[int, np.ndarray]], start: int) -> bool:
@@ -164,7 +162,7 @@ def is_speech(chunks: Sequence[tuple[int, np.ndarray]], start: int) -> bool:
 
     On a busy machine some may be missing, but none may be elsewhere.
     """
-    speech, first_ns = _speech(), chunks[0][0]
+    speech, first_ns = speech_of(16_000), chunks[0][0]
     places = [start + 320 * round((at_ns - first_ns) / 20_000_000) for at_ns, _ in chunks]
     pairs = zip(places, chunks, strict=True)
     return all(np.array_equal(speech.samples(place, 320)[:, 0], sound) for place, (_, sound) in pairs)

@@ -183,8 +183,6 @@ PRIVATE = ("mcu/spy-1/fast", "lab/fast", "mcu/spy-1/secret", "lab/secret", "mcu/
 
 
 DESCRIBE, LIST = "mcu/spy-1/describe", "mcu/spy-1/local-only"
-LISTED = tuple(f"outgoing/{metric}" for metric in PRIVATE)
-TUNED = ("incoming/mcu/spy-1/tune", "incoming/lab/tune")
 
 
 def local_only(*topics: str, uid: str = "spy-1") -> Message:
@@ -207,7 +205,7 @@ def cleared(metric: str) -> Message:
 
 
 FAST, SLOW = ("mcu/spy-1/fast", "lab/fast"), ("mcu/spy-1/slow", "lab/slow")
-KNOWN = local_only(*LISTED)
+KNOWN = local_only(*(f"outgoing/{metric}" for metric in PRIVATE))
 NONSENSE = (b"", b"{", b'{"device_uid": 5, "interface": "a"}', b'["device_uid"]', b"\xff\xfe", sample("slow"))
 #: What is offered one after the other, and what passes then: the message, nothing, or the topics that are named.
 HISTORIES: dict[str, list[tuple[Message, bool | list[str]]]] = {
@@ -285,7 +283,7 @@ def test_which_commands_stay() -> None:
     incoming = [f"{BASE}/incoming/{metric}" for metric in ("mcu/spy-1/describe", "mcu/spy-1/tune", "mcu/spy-1/set")]
     aliases = [f"{BASE}/incoming/{metric}" for metric in ("lab/tune", "lab/set", "estop", "drive-values")]
     assert [topics.stays(topic) for topic in (*incoming, *aliases)] == [True] * 3 + [False] * 4
-    topics.admit(local_only(*TUNED, "incoming/estop"))
+    topics.admit(local_only("incoming/mcu/spy-1/tune", "incoming/lab/tune", "incoming/estop"))
     assert [topics.stays(topic) for topic in (*incoming, *aliases)] == [True, True, False, True, False, False, False]
 
 
@@ -300,17 +298,15 @@ def test_memory_is_bounded() -> None:
     assert sum(len(topics.admit(message)) for message in slow) == 256, "MCUs"
 
 
-DOCUMENT = "".join((ROOT / "docs/ext" / name).read_text() for name in ("boards.md", "serial-protocol.md"))
-
-
 def test_the_examples_are_a_valid_manifest_and_valid_frames() -> None:
-    (code,) = re.findall(r"```python\n(.*?)```", DOCUMENT, re.DOTALL)
+    text = "".join((ROOT / "docs/ext" / name).read_text() for name in ("boards.md", "serial-protocol.md"))
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     names: dict[str, Any] = {}
     exec(code, names)
     assert manifest.parse_hello(names["HELLO"]).device_uid == "lamp-1"
     described = manifest.parse_describe(names["DESCRIBE"])
     assert set(claims(described.payload()).granted) == {"incoming/lights/lamp", "outgoing/lights/lamp"}
-    request, command = (bytes.fromhex(found) for found in re.findall(r"`((?:[0-9a-f]{2} ){9,}00)`", DOCUMENT))
+    request, command = (bytes.fromhex(found) for found in re.findall(r"`((?:[0-9a-f]{2} ){9,}00)`", text))
     assert frame.decode(request[:-1]).type is frame.Type.DESCRIBE_REQ
     assert frame.decode(command[:-1]) == frame.Frame(frame.Type.CMD, b"\x01", 3, 1)
 
@@ -318,12 +314,8 @@ def test_the_examples_are_a_valid_manifest_and_valid_frames() -> None:
 # -- two devices with one channel: neither gets it; two with one uid: a warning; our own firmware behind a pty
 
 
-def imu(uid: str) -> M:
-    return IMU.but(uid=uid)
-
-
 def test_a_channel_that_two_claim_is_unused_until_one_leaves(rig: SerialRig, caplog: pytest.LogCaptureFixture) -> None:
-    one, two = rig.mcu(imu("imu-1"), "one"), rig.mcu(imu("imu-2"), "two", plugged=False)
+    one, two = rig.mcu(IMU.but(uid="imu-1"), "one"), rig.mcu(IMU.but(uid="imu-2"), "two", plugged=False)
     rig.bridge("one")
     rig.bridge("two")
     one.stream(50, motion(1000))
@@ -350,7 +342,7 @@ def test_a_channel_that_two_claim_is_unused_until_one_leaves(rig: SerialRig, cap
 def test_of_two_that_claim_one_channel_that_of_the_config_has_it(
     memory_rig: SerialRig, caplog: pytest.LogCaptureFixture
 ) -> None:
-    one, two = memory_rig.mcu(imu("imu-1"), "one"), memory_rig.mcu(imu("imu-2"), "two", plugged=False)
+    one, two = memory_rig.mcu(IMU.but(uid="imu-1"), "one"), memory_rig.mcu(IMU.but(uid="imu-2"), "two", plugged=False)
     caplog.set_level(logging.INFO)
     for name in ("one", "two"):
         memory_rig.bridge(name, aliases={"sensors/imu-fast": "imu-2"})
@@ -415,9 +407,6 @@ def test_a_manifest_cleared_by_another_is_published_again(rig: SerialRig) -> Non
     rig.listener("late").described("lamp-1")
 
 
-PLUGGED_IN_S = 3.0  # two seconds on a machine with nothing else to do
-
-
 @pytest.mark.alone
 def test_found_within_seconds_when_plugged_in_again_and_every_sample_arrives(tmp_path: Path) -> None:
     uid = "goob-imu"
@@ -430,7 +419,7 @@ def test_found_within_seconds_when_plugged_in_again_and_every_sample_arrives(tmp
         board.replug()
         assert until(lambda: len(rig.world.on("sensors/imu-fast")) > count)
         first = rig.world.on("sensors/imu-fast")[count]
-        assert rig.world.at[rig.world.received.index(first)] - plugged < PLUGGED_IN_S
+        assert rig.world.at[rig.world.received.index(first)] - plugged < 3.0, "two on an idle machine"
         rig.described(uid)
         assert until(lambda: len(rig.world.on("sensors/imu-fast")) >= count + 96 * cases(1, 5))
         numbers = [body["seq"] for body in rig.world.payloads("sensors/imu-fast")[count:]]

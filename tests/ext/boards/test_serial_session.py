@@ -31,7 +31,6 @@ from tests.support import cases
 
 OPENED = 100.0
 WALL_MS = 1_700_000_000_123
-STATE_PAYLOAD = b"\1\0\1"
 
 
 class Host:
@@ -93,7 +92,7 @@ def host() -> Host:
     return Host()
 
 
-def state(interface: int = 2, payload: bytes = STATE_PAYLOAD, sequence: int = 9, ms: int = 77) -> bytes:
+def state(interface: int = 2, payload: bytes = b"\1\0\1", sequence: int = 9, ms: int = 77) -> bytes:
     return wire.frame(wire.STATE, payload, interface, sequence, ms)
 
 

@@ -17,7 +17,6 @@ from pebble.extensions.media.sound import make_sound_encoder
 from pebble.extensions.media.speech import Speech
 
 RATE = 16000
-CHUNK = 320  # 20 ms
 LAST = 0xFFFFFFFF
 EPOCH_MS = 1_700_000_000_000
 
@@ -142,7 +141,7 @@ def test_when_the_sender_stops_there_is_an_end(concealment_ms: int) -> None:
 
 
 def test_what_is_made_up_begins_where_the_sound_ended_and_fades_to_nothing() -> None:
-    recorded = Speech(RATE).samples(0, 30 * CHUNK)
+    recorded = Speech(RATE).samples(0, 30 * RATE // 50)
     encoder = make_sound_encoder("pcm", rate=RATE, channels=1)
     raw = encoder.encode(to_bytes(recorded), EPOCH_MS)
     played = play(JitterBuffer(), [(0.02 * index, one) for index, one in enumerate(raw)])

@@ -87,10 +87,9 @@ class Pair:
         self.lan = lan = Lan()
         self.stranger = MemoryTransport("stranger", lan).open()
         shared, granted = {"shares": ["wheel-odometry"]}, {"commanded": {"goob": ["drive-values"]}}
-        at_hub = {name: MemoryTransport(f"{name}-lan", lan) for name in ("fred", "goob")}
-        self.fred = One(folder / "fred", at_hub["fred"], "fred", stack, **shared, **granted)
+        self.fred = One(folder / "fred", MemoryTransport("fred-lan", lan), "fred", stack, **shared, **granted)
         listens = {"fred": ["wheel-odometry"], "carl": []}
-        self.goob = One(folder / "goob", at_hub["goob"], "goob", stack, listens=listens)
+        self.goob = One(folder / "goob", MemoryTransport("goob-lan", lan), "goob", stack, listens=listens)
         self.robot = Robot(self.goob.config, MemoryTransport("script", self.goob.hub).open(), lambda _above: 7)
         stack.callback(self.robot.close)
 

@@ -27,10 +27,7 @@ from tests.kit.robot import Program, ProgramRobot
 from tests.support import WAIT_S, Broker, gone, until
 
 RATE = 16_000
-LOUDSPEAKER = [sys.executable, "-m", "pebble.simulation.loudspeaker"]
 RAW = ["-q", "-t", "raw", "-f", "S16_LE", "-c", "{channels}", "-r", "{rate}", "-D", "{device}", "-"]
-#: A player that never ends by itself, and starts at once.
-LONG = ["sh", "-c", "exec sleep 60"]
 
 
 def tone(seconds: float, channels: int = 1, rate: int = RATE) -> Samples:
@@ -54,7 +51,7 @@ class Soundboard(ProgramRobot):
         super().__init__(kind, port, {})
         self.sounds, self.record = self.folder / "sounds", self.folder / "played"
         self.sounds.mkdir()
-        self.player = [*LOUDSPEAKER, "--record", str(self.record)]
+        self.player = [sys.executable, "-m", "pebble.simulation.loudspeaker", "--record", str(self.record)]
         options = {"directory": str(self.sounds), "player_command": self.player, **playback}
         self.raw["services"] = {
             "mqtt_bridge": {"media": {"audio_receiver": {"command": [*self.player, *RAW]}}},
@@ -170,7 +167,7 @@ def test_a_clip_is_listed_played_as_it_is_and_over(make: Make, kind: str) -> Non
 
 def test_what_plays_and_what_stops(make: Make) -> None:
     """The forms of commands are decoded in tests/contract/test_codec.py."""
-    board = make(player_command=LONG, clip=0.1)
+    board = make(player_command=["sh", "-c", "exec sleep 60"], clip=0.1)
     plays: list[Any] = [{"action": word.upper(), "file": "a.wav"} for word in PLAY]
     plays += [{"action": "unknown", "enabled": True, "file": "a.wav"}]
     stops: list[Any] = [{"action": word.title(), "enabled": True} for word in STOP]

@@ -8,8 +8,7 @@ from wifi.connection import Connection
 from wifi.dns import answer, query
 from wifi.sntp import WallClock, epoch_ms, request
 
-HOST = "Broker.Example.org"
-ASKED = query(HOST, b"\x12\x34")
+ASKED = query("Broker.Example.org", b"\x12\x34")
 NAME = b"\xc0\x0c"  # where the question has it
 
 

@@ -9,6 +9,15 @@ from common.lines import Lines, clamp, number
 from goob_imu.imu import Imu
 
 
+def taken(sender):
+    """What is on its way, and it is gone."""
+    size = len(sender.ring)
+    data = bytes([sender.ring[(sender.first + index) % size] for index in range(sender.used)])
+    sender.first = (sender.first + sender.used) % size
+    sender.used = 0
+    return data
+
+
 class Recorder:
     """Records the commands to the robot and the lines to the host."""
 
@@ -22,15 +31,7 @@ class Recorder:
     def give(self, data):
         for byte in data:
             self.lines.take(byte)
-        return self.received()
-
-    def received(self):
-        lines = self.lines
-        size = len(lines.ring)
-        output = bytes([lines.ring[(lines.first + index) % size] for index in range(lines.used)])
-        lines.first = (lines.first + lines.used) % size
-        lines.used = 0
-        return output
+        return taken(self.lines)
 
 
 def obeyed(data):
@@ -103,7 +104,7 @@ def test_a_host_that_does_not_read_loses_whole_lines():
     lines = calls.lines
     for _ in range(20):
         lines.put(b"T a0=512 a1=512 a2=512")
-    assert calls.received() == b"T a0=512 a1=512 a2=512\r\n" * 5
+    assert taken(lines) == b"T a0=512 a1=512 a2=512\r\n" * 5
     calls.give(b"M 1 1\n")
     assert calls.commands, "it is obeyed all the same"
 
@@ -130,15 +131,6 @@ def test_noise_among_lines():
 
 DESCRIBE_REQ = bytes([3, 1, 2, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 3, 0x85, 0x6B, 0])
 CMD = bytes([3, 1, 0x20, 2, 3, 2, 1, 1, 1, 1, 1, 1, 1, 4, 1, 0x9B, 0x7C, 0])
-
-
-def taken(sender):
-    """What is on its way, and it is gone."""
-    size = len(sender.ring)
-    data = bytes([sender.ring[(sender.first + index) % size] for index in range(sender.used)])
-    sender.first = (sender.first + sender.used) % size
-    sender.used = 0
-    return data
 
 
 def plain(frame):

@@ -96,7 +96,8 @@ class MemoryRig:
         self.remote = Client(MemoryTransport("operator", self.remote_hub))
         self.robot_side: MemoryTransport
         self._running: list[Running] = []
-        monkeypatch.setattr(bridge_module, "remote_transport", self._remote_transport)
+        remote = lambda _config, name, *, will=None: MemoryTransport(name, self.remote_hub, will=will)  # noqa: E731
+        monkeypatch.setattr(bridge_module, "remote_transport", remote)
         monkeypatch.setenv("XDG_STATE_HOME", tempfile.mkdtemp(dir=os.environ["XDG_STATE_HOME"]))  # an audit of its own
 
     def bridge(self, **section: Any) -> MqttBridge:
@@ -112,9 +113,6 @@ class MemoryRig:
             self._running.pop().stop()
         self.local.transport.close()
         self.remote.transport.close()
-
-    def _remote_transport(self, _config: Config, name: str, *, will: Message | None = None) -> MemoryTransport:
-        return MemoryTransport(name, self.remote_hub, will=will)
 
 
 class Quiet:

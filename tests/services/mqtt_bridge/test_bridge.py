@@ -35,8 +35,6 @@ CAMERA, SPEAKER, MICROPHONE = "camera_publisher", "audio_receiver", "audio_publi
 STOP, STATE, DRIVE = "incoming/estop", "outgoing/estop/mcu", "incoming/drive-values"
 PRESS, MIRROR_FLAG = b'{"stop": "00000000000000a1", "by": "test"}', "incoming/flags/remote-mirror"
 ALL = (CAMERA, MICROPHONE, SPEAKER)
-DEVICES = {"enabled": True}
-ASKED = MediaRequest(enabled=True)
 YES, NO = ProgramRequest(on=True), ProgramRequest(on=False)
 
 
@@ -56,7 +54,7 @@ class TestDecision:
         opus = ProgramRequest(on=True, encoding="opus")
         media = Media((CAMERA, MICROPHONE), running={MICROPHONE: opus})
         assert media.requests() == {CAMERA: NO}, "and the flag of audio is not known yet"
-        media.request(AUDIO_CONTROL, ASKED)
+        media.request(AUDIO_CONTROL, MediaRequest(enabled=True))
         media.allow(MQTT_AUDIO, True)
         assert media.requests() == {CAMERA: NO, MICROPHONE: YES}, "there is no loudspeaker"
         media = Media(ALL, running={CAMERA: YES})
@@ -75,7 +73,7 @@ class AskingBridge(World):
         self.asked: list[notes.Note] = []
 
     def begin(self, **section: Any) -> None:
-        self.start(av_daemon=DEVICES, **section)
+        self.start(av_daemon={"enabled": True}, **section)
         self.run()
 
     def wanted(self, program: str, kind: type[Wanted | Held] = Wanted, *, after: float = 3.0) -> str:
@@ -107,9 +105,6 @@ def either(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> I
     bridge.close()
 
 
-each_side = pytest.mark.parametrize("side", ["local", "remote"])
-
-
 class TestBridge:
     def test_flags_gate_and_requests_start(self, either: AskingBridge) -> None:
         either.begin()
@@ -123,7 +118,7 @@ class TestBridge:
             assert either.wanted(CAMERA) == wanted
         assert not any("audio" in note.program and note.on for note in either.asked if isinstance(note, Wanted))
 
-    @each_side
+    @pytest.mark.parametrize("side", ["local", "remote"])
     def test_a_retained_request_never_does(self, either: AskingBridge, side: str) -> None:
         client: Client = getattr(either, side)
         client.publish(VIDEO, ON, retain=True)

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 from msgspec import UNSET
+from msgspec.structs import replace
 
 from pebble.contract import ESTOP, ESTOP_STATE, codec
 from pebble.contract.payloads import EstopCommand, EstopState
@@ -76,10 +77,10 @@ class Robot:
             self.stops.follow(owner, None)
             return
         if mark == "0":
-            state = replace_state(FREE, boot=f"{int(before.boot) + 1:08}")
+            state = replace(FREE, boot=f"{int(before.boot) + 1:08}")
         else:
             new = NAME[letter] not in before.recent
-            state = replace_state(
+            state = replace(
                 before,
                 latched=mark != "-",
                 count=before.count + new,
@@ -88,10 +89,6 @@ class Robot:
             )
         self.states[owner] = state
         self.stops.follow(owner, state)
-
-
-def replace_state(state: EstopState, **fields: Any) -> EstopState:
-    return EstopState(**{name: fields.get(name, getattr(state, name)) for name in state.__struct_fields__})
 
 
 def _addresses(payloads: list[bytes]) -> str:
@@ -177,7 +174,7 @@ def test_the_bridge_repeats_it_on_the_robots_side_only(monkeypatch: pytest.Monke
     assert [stop.owner for stop in repeated[:4]] == ["serial", "tail"] * 2
     assert {stop.stop for stop in repeated} == {first.stop}
     for owner in TWO:
-        state = replace_state(FREE, latched=True, count=1, recent=[first.stop])
+        state = replace(FREE, latched=True, count=1, recent=[first.stop])
         world.local.publish(ESTOP_STATE.topic("", owner=owner)[1:], codec.encode(ESTOP_STATE, state), retain=True)
     world.run(1)
     before = len(world.local.on(STOP))
@@ -196,7 +193,7 @@ def test_without_a_name_an_owner_that_lives_and_saves_it_gets_it_once(
     stops.follow("serial", FREE)
     stops.accept(payload("a"), nameless=True)
     assert stops.repeat()
-    state = replace_state(FREE, boot=boot, latched=True, count=1, recent=[NAME["b"]], persisted=persisted)
+    state = replace(FREE, boot=boot, latched=True, count=1, recent=[NAME["b"]], persisted=persisted)
     stops.follow("serial", state)
     assert bool(stops.repeat()) is repeats
 
@@ -211,7 +208,7 @@ def test_one_of_the_robots_own_side_is_repeated_too(one: bool, monkeypatch: pyte
     first, *repeated = [codec.decode(ESTOP, raw) for raw in world.local.payloads(STOP) if raw != b"{}"]
     assert len(repeated) >= 2
     assert {(stop.stop, stop.owner) for stop in (first, *repeated)} == {(first.stop, "serial")}
-    state = replace_state(FREE, latched=True, count=1, recent=[first.stop])
+    state = replace(FREE, latched=True, count=1, recent=[first.stop])
     world.local.publish(ESTOP_STATE.topic("", owner="serial")[1:], codec.encode(ESTOP_STATE, state), retain=True)
     world.run(1)
     before = len(world.local.on(STOP))

@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -41,9 +42,6 @@ class Bench:
 
     It is the motor owner ``instance`` of the robot; ``peer`` is listed as another one.
     """
-
-    service: MotorBridge
-    running: Running
 
     def __init__(
         self,
@@ -80,14 +78,9 @@ class Bench:
         self.world = Listener(create(network, "operator", settings))
         self.operator = self.world.transport
         name = f"robot-{instance}"
-        self._new_service = lambda: MotorBridge(config, create(network, name, settings), instance=instance)
-        self.start()
-
-    def start(self) -> None:
-        before = len(self.lines)
-        self.service = self._new_service()
-        self.running = Running(self.service)
-        assert until(lambda: len(self.lines) >= before + 2)  # the stop after opening and after booting
+        self.service = MotorBridge(config, create(network, name, settings), instance=instance)
+        self._running = Running(self.service)
+        assert until(lambda: len(self.lines) >= 2)  # the stop after opening and after booting
 
     @property
     def lines(self) -> list[str]:
@@ -129,18 +122,8 @@ class Bench:
         self.send("estop-reset", {"boot": self.state["boot"], "count": self.state["count"], "by": "eve"})
         return until(lambda: not self.state["latched"])
 
-    def stop(self) -> None:
-        self.running.stop()
-
-    def restart(self) -> None:
-        """Stop it, and start it again; returns once that one has published its state."""
-        boot = self.state.get("boot")
-        self.stop()
-        self.start()
-        assert until(lambda: self.state.get("boot") not in (boot, None))
-
     def close(self) -> None:
-        self.stop()
+        self._running.stop()
         self.operator.close()
         self.mcu.__exit__(None, None, None)
 
@@ -148,12 +131,10 @@ class Bench:
 @pytest.fixture
 def bench(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Bench]:
     kind, section = getattr(request, "param", ("goob", {}))
-    bench = Bench(tmp_path, kind, **section)
-    yield bench
-    bench.close()
+    with closing(Bench(tmp_path, kind, **section)) as bench:
+        yield bench
 
 
-FRED = ("fred", {"telemetry": {"publish_touch_sensors": True}})
 ANN = {"id": "aaaaaaaa", "by": "ann", "device": "phone"}
 
 
@@ -205,7 +186,7 @@ def test_a_second_program_at_the_port_is_named_until_it_has_gone(
         Port(port, 115200)
 
 
-@pytest.mark.parametrize("bench", [FRED], indirect=True)
+@pytest.mark.parametrize("bench", [("fred", {"telemetry": {"publish_touch_sensors": True}})], indirect=True)
 def test_every_field_of_a_line_is_published_and_what_the_motors_get_again_while_they_run(bench: Bench) -> None:
     """An odometry that begins while a robot drives steadily learns in which direction."""
     assert until(lambda: bench.payloads("touch-sensors") and bench.payloads("charging-status"))
@@ -260,8 +241,7 @@ def test_robots_with_one_state_directory_do_not_share_a_stop(tmp_path: Path) -> 
 
 
 def test_a_stop_that_is_repeated_for_another_listed_owner_is_ignored(tmp_path: Path) -> None:
-    bench = Bench(tmp_path, "goob", instance="left", peer="right")
-    try:
+    with closing(Bench(tmp_path, "goob", instance="left", peer="right")) as bench:
         assert until(lambda: bench.world.on("estop/left"))
         bench.send("estop", {"stop": "a" * 16, "owner": "right"})
         bench.send("control", ANN)  # judged after it
@@ -270,8 +250,6 @@ def test_a_stop_that_is_repeated_for_another_listed_owner_is_ignored(tmp_path: P
         for number, owner in enumerate(({"owner": "left"}, {"owner": "else"}, {}), start=1):
             bench.send("estop", {"stop": f"{number:016x}", **owner})
             assert bench.world.became("estop/left", latched=True, count=number)
-    finally:
-        bench.close()
 
 
 def test_a_drive_command_that_waited_renews_control_before_the_silence_counts(bench: Bench) -> None:
@@ -305,9 +283,8 @@ MOVED, LIT = "M 0.500 0.500", "L 1.000 0.700 0.200"
 
 @pytest.fixture(scope="module")
 def grouped(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    bench = Bench(tmp_path_factory.mktemp("groups"), "goob", groups=True)
-    yield bench
-    bench.close()
+    with closing(Bench(tmp_path_factory.mktemp("groups"), "goob", groups=True)) as bench:
+        yield bench
 
 
 def lines_of(bench: Bench, metric: str, body: Any, least: int = 1) -> list[str]:

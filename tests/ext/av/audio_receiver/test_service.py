@@ -8,7 +8,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from pebble.services.audio_receiver import service as service_module
 from pebble.services.audio_receiver.service import AudioReceiver
 from pebble.transports import QoS, Subscription
 from pebble.transports.memory import MemoryHub, MemoryTransport
-from tests.ext.av.media_rig import BASE, MediaProgram, client
+from tests.ext.av.media_rig import BASE, MediaProgram, client, speech_of
 from tests.kit.robot import Running
 from tests.kit.sound import best_match
 from tests.support import WAIT_S, Broker, until
@@ -67,12 +66,7 @@ class Recorder:
 
 @pytest.fixture
 def recorder(tmp_path: Path) -> Recorder:
-    folder = tmp_path / "played"
-    folder.mkdir()
-    return Recorder(folder)
-
-
-speech_of = cache(Speech)
+    return Recorder(tmp_path)
 
 
 class Operator:

@@ -32,7 +32,6 @@ from tests.kit.robot import ProgramRobot
 from tests.kit.scene import read_counter
 from tests.support import WAIT_S, Broker, quickly, until
 
-SMALL = {"width": 320, "height": 240, "fps": 30}
 PICTURE, SOUND = FrameInfo(format="mjpeg", width=640, height=480), FrameInfo(format="s16le", rate=16_000, channels=1)
 
 
@@ -111,10 +110,6 @@ def report(stream: Stream) -> MediaReport:
     return stream.report(time.monotonic())
 
 
-def synthetic() -> Callable[[], Source]:
-    return sources.camera(options(video={**SMALL, "backend": "synthetic"}), time.monotonic())
-
-
 def rests(stream: Stream) -> bool:
     return until(lambda: report(stream).doing == "rests: nobody reads")
 
@@ -153,8 +148,8 @@ def test_who_comes_back_soon_finds_the_device_open(streams: Streams) -> None:
 
 @pytest.mark.parametrize("born", [True, False])
 def test_frames_are_born_in_the_segment_where_that_is_possible_and_stamped(streams: Streams, born: bool) -> None:
-    writer = Remembering(born=born)
-    stream = streams(writer, synthetic())
+    writer, video = Remembering(born=born), {"width": 320, "height": 240, "fps": 30, "backend": "synthetic"}
+    stream = streams(writer, sources.camera(options(video=video), time.monotonic()))
     assert until(lambda: len(writer.frames) >= 5)
     numbers = [read_counter(picture(data, info)) for info, data in writer.frames[:5]]
     assert None not in numbers
@@ -323,26 +318,24 @@ def test_a_frozen_picture_is_noticed_although_its_header_changes(
     assert until(lambda: report(stream).problem) if frozen else not report(stream).problem
 
 
-class TestReports:
-    def test_silent_programs_are_forgotten_and_there_is_room_for_every_robot_and_no_more(self) -> None:
-        reports, running = Reports(), MediaReport(running=True)
-        reports.put("camera_publisher", running, 100.0)
-        reports.put("audio_publisher", running, 103.0)
-        assert list(reports.current(104.9)) == ["audio_publisher", "camera_publisher"]
-        assert list(reports.current(105.1)) == ["audio_publisher"]
-        assert reports.current(108.1) == {}
-        for number in range(1000):
-            reports.put(f"program-{number}", running, 200.0)
-        reports.put("program-0", MediaReport(running=False), 201.0)
-        assert len(reports.current(201.0)) == 32
-        assert not reports.current(201.0)["program-0"].running
+def test_silent_programs_are_forgotten_and_there_is_room_for_every_robot_and_no_more() -> None:
+    reports, running = Reports(), MediaReport(running=True)
+    reports.put("camera_publisher", running, 100.0)
+    reports.put("audio_publisher", running, 103.0)
+    assert list(reports.current(104.9)) == ["audio_publisher", "camera_publisher"]
+    assert list(reports.current(105.1)) == ["audio_publisher"]
+    assert reports.current(108.1) == {}
+    for number in range(1000):
+        reports.put(f"program-{number}", running, 200.0)
+    reports.put("program-0", MediaReport(running=False), 201.0)
+    assert len(reports.current(201.0)) == 32
+    assert not reports.current(201.0)["program-0"].running
 
 
 # -- av_daemon as a real process: frames, what it says of them, and how it ends
 
 
 SYNTHETIC = {"video": {"backend": "synthetic", "fps": 30}, "audio": {"source": "synthetic"}}
-DEAF = {"video": {"backend": "libcamera", "fps": 30}, "audio": {"enabled": False}}
 
 
 class Robot(ProgramRobot):
@@ -443,7 +436,8 @@ def test_a_killed_capture_program_is_back_and_the_reader_never_noticed(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, local: Broker
 ) -> None:
     rpicam = Installed(monkeypatch, tmp_path, "rpicam-vid", "tests.fakes.fake_rpicam")
-    with Robot("mqtt", local.port, DEAF) as robot, FrameReader(robot.run_dir, "camera") as reader:
+    section = {"video": {"backend": "libcamera", "fps": 30}, "audio": {"enabled": False}}
+    with Robot("mqtt", local.port, section) as robot, FrameReader(robot.run_dir, "camera") as reader:
         first = reader.read(10)
         os.kill(rpicam.pids[-1], signal.SIGKILL)
         assert until(lambda: len(rpicam.pids) == 2)

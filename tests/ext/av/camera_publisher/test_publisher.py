@@ -43,13 +43,6 @@ def frame(form: str = "bgr24") -> Frame:
     return Frame(info, packed[form](picture), shared=False)
 
 
-def red_corner(picture: Any) -> tuple[bool, bool]:
-    """Where the red quarter is: (in the lower half, in the right half)."""
-    height, width = picture.shape[:2]
-    rows, columns = np.nonzero(picture[:, :, 2] > 128)
-    return bool(rows.mean() > height / 2), bool(columns.mean() > width / 2)
-
-
 def test_requests_for_a_full_picture_are_answered_once_a_second() -> None:
     """A key frame that the encoder makes by itself answers them as well; what the sender needs is not rationed."""
     keyframes, answers = KeyframeRequests(), []
@@ -73,7 +66,8 @@ def test_requests_for_a_full_picture_are_answered_once_a_second() -> None:
 def test_pictures_are_turned_clockwise(form: str, turn: int, corner: tuple[bool, bool]) -> None:
     picture = Shape(None, None, turn).picture(frame(form))
     assert picture.shape == ((48, 64, 3) if turn in (0, 180) else (64, 48, 3))
-    assert red_corner(picture) == corner
+    rows, columns = np.nonzero(picture[:, :, 2] > 128)  # where it is red: in the lower half, in the right half
+    assert (rows.mean() > picture.shape[0] / 2, columns.mean() > picture.shape[1] / 2) == corner
 
 
 @pytest.mark.parametrize(
@@ -122,9 +116,6 @@ class Feed(Queue[Frame]):
             return None
 
 
-ENDS = ("sent", "overwritten", "failed", "refused")
-
-
 class Bench:
     """The service in this process, between two networks in memory."""
 
@@ -153,7 +144,7 @@ class Bench:
         assert until(lambda: self._dealt_with() > before)
 
     def _dealt_with(self) -> int:
-        return sum(self.service.counters[what] for what in ENDS)
+        return sum(self.service.counters[what] for what in ("sent", "overwritten", "failed", "refused"))
 
     def close(self) -> None:
         self._running.stop()
@@ -285,15 +276,6 @@ def rate_of(pictures: list[Seen]) -> float:
     return 1000 * (len(pictures) - 1) / (pictures[-1].captured_ms - pictures[0].captured_ms)
 
 
-def are_what_was_captured(pictures: list[Seen], camera: Camera) -> bool:
-    """True if the pictures of full size have the numbers that were captured.
-
-    A machine that has too much to do makes pictures smaller, until their number cannot be read.
-    """
-    whole = [picture for picture in pictures if picture.shape == (240, 320, 3)]
-    return bool(whole) and all(picture.number == camera.numbers[picture.captured_ms] for picture in whole)
-
-
 def test_every_form_in_turn_at_the_wanted_rate(local: Broker, remote: Broker, viewer: Viewer) -> None:
     with publisher(local, remote, publish_fps=10) as robot, Camera(robot.run_dir) as camera:
         first = viewer.wait(1)[0]
@@ -308,7 +290,10 @@ def test_every_form_in_turn_at_the_wanted_rate(local: Broker, remote: Broker, vi
         robot.ask(encoding="smoke signals")
         viewer.wait_for("json")
         assert until(lambda: robot.reports[-1].rate == pytest.approx(10, abs=0.7), 60)
-        assert are_what_was_captured(viewer.received, camera)
+        # A machine that has too much to do makes pictures smaller, until their number cannot be read.
+        whole = [picture for picture in viewer.received if picture.shape == (240, 320, 3)]
+        assert whole
+        assert all(picture.number == camera.numbers[picture.captured_ms] for picture in whole)
         assert viewer.decoder.problem == ""
 
 

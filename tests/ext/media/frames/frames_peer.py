@@ -21,7 +21,6 @@ import numpy as np
 from pebble.extensions.media.frames import Frame, FrameInfo, FrameReader, FrameWriter, views
 from pebble.runtime.parent import end_with_parent as die_with_parent
 
-FORMAT = "bgr24"
 _PR_SET_DUMPABLE = 4
 
 
@@ -95,7 +94,7 @@ class Writer:
         slot = self._writer.slot(self._options.size)
         array = self._frame if slot is None else slot.array
         stamp(array, number)
-        info = FrameInfo(captured_ns=time.monotonic_ns(), format=FORMAT, width=self._options.size // 3, height=1)
+        info = FrameInfo(captured_ns=time.monotonic_ns(), format="bgr24", width=self._options.size // 3, height=1)
         return self._writer.write(array, info) if slot is None else slot.send(info)
 
     def report(self) -> dict[str, Any]:

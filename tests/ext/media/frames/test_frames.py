@@ -89,14 +89,8 @@ class FramesNet:
         folder.mkdir(mode=0o700, exist_ok=True)
         self._peers: list[Peer] = []
 
-    def writer(self, **options: Any) -> Peer:
-        return self._start("writer", Options(**options))
-
-    def reader(self, **options: Any) -> Peer:
-        return self._start("reader", Options(**options))
-
-    def _start(self, role: str, options: Options) -> Peer:
-        peer = Peer(role, self.folder, options)
+    def start(self, role: str, **options: Any) -> Peer:
+        peer = Peer(role, self.folder, Options(**options))
         self._peers.append(peer)
         return peer
 
@@ -137,10 +131,10 @@ def test_a_deep_reader_gets_them_all_in_order_and_small_frames_travel_as_bytes(t
 
 
 def test_readers_and_writers_that_are_killed_are_noticed_and_their_segments_swept(net: FramesNet) -> None:
-    writer = net.writer(size=SMALL)
+    writer = net.start("writer", size=SMALL)
     resting = writer.has(unwanted=10)
     assert (resting["wanted"], resting.get("written", 0)) == (False, 0)
-    readers = [net.reader(), net.reader(views=True)]
+    readers = [net.start("reader"), net.start("reader", views=True)]
 
     def all_receive(life: int) -> None:
         for reader in readers:
@@ -150,7 +144,7 @@ def test_readers_and_writers_that_are_killed_are_noticed_and_their_segments_swep
 
     all_receive(1)
     writer.kill()
-    writer = net.writer(size=SMALL)
+    writer = net.start("writer", size=SMALL)
     all_receive(2)
     assert len(StreamNames(net.folder, "camera").lock_paths()) == 1, "that of the killed writer is gone"
     maps = [line for peer in (writer, *readers) for line in Path(f"/proc/{peer.pid}/maps").read_text().splitlines()]
@@ -185,9 +179,9 @@ def unprivileged_net() -> Iterator[FramesNet]:
 
 
 def test_a_reader_without_shared_memory_gets_bytes_and_reports_it(unprivileged_net: FramesNet) -> None:
-    poor = unprivileged_net.reader(memlock=64 << 10, user=UNPRIVILEGED_USER)
-    rich = unprivileged_net.reader(user=UNPRIVILEGED_USER)
-    writer = unprivileged_net.writer(size=QVGA, user=UNPRIVILEGED_USER)
+    poor = unprivileged_net.start("reader", memlock=64 << 10, user=UNPRIVILEGED_USER)
+    rich = unprivileged_net.start("reader", user=UNPRIVILEGED_USER)
+    writer = unprivileged_net.start("writer", size=QVGA, user=UNPRIVILEGED_USER)
     seen = poor.has(frames=20, copied=20)
     assert "LimitMEMLOCK=" in seen["problem"]
     assert (seen["wrong"], seen.get("shared", 0)) == (0, 0)
@@ -301,7 +295,7 @@ def test_past_a_limit_of_mapped_memory_frames_come_as_bytes_and_the_reader_repor
 ) -> None:
     monkeypatch.setattr(frame_reader, "MAPPED_LIMIT", -1)
     with FrameReader(net.folder, "camera") as reader:
-        net.writer(size=SMALL, rate=60)
+        net.start("writer", size=SMALL, rate=60)
 
         def comes_as_bytes() -> bool:
             frame = reader.read(1)

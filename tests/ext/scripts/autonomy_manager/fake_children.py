@@ -13,8 +13,9 @@ from msgspec.structs import replace
 
 from pebble.config import Security
 from pebble.contract.payloads import ControlState
+from pebble.extensions.operator.client.forms import Setting
 from pebble.services.autonomy_manager.child import Launch
-from pebble.services.autonomy_manager.script import Script
+from pebble.services.autonomy_manager.script import Dependency, Script
 from pebble.services.autonomy_manager.service import AutonomyManager
 from pebble.transports import Message, QoS
 from tests.ext.operator.client.estop_robot import estop_state
@@ -22,6 +23,12 @@ from tests.kit.robot import BASE, Listener, LocalNetwork, Running
 from tests.support import Clock, until
 
 MOTORS = {"enabled": True, "serial": {"port": "/dev/null"}}
+
+
+def script(file: str, *dependencies: Dependency, **more: Any) -> Script:
+    speed = Setting(key="speed", type="float", default=0.5, arg="--speed", max=1)
+    fields = {"label": file, "settings": (speed,), "ours": True, **more}
+    return Script(file=file, command=(file,), folder=Path(), dependencies=dependencies, **fields)
 
 
 class FakeChild:

@@ -290,16 +290,12 @@ def test_what_cannot_be_executed_is_named_with_the_reason(first: str, mode: int,
         begun(path)
 
 
-def denied(_pid: int) -> int:
-    raise PermissionError(errno.EPERM, "Operation not permitted")
-
-
 @pytest.mark.parametrize(("first", "may"), [("#!/usr/bin/env -S sh -e\n", True), ("\n", True), ("#!/bin/sh\n", False)])
 def test_others_start_and_their_end_is_noticed_also_where_pidfd_open_is_denied(
     first: str, may: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not may:
-        monkeypatch.setattr(os, "pidfd_open", denied)
+        monkeypatch.setattr(os, "pidfd_open", refused(errno.EPERM))
     codes: list[int] = []
     process = begun(program(tmp_path, f"{first}exit 7\n", 0o755))
     process.watch(codes.append)

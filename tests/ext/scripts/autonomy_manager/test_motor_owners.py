@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import operator
-from pathlib import Path
 from typing import Any
 
 import pytest
-from msgspec import structs
 
 from pebble.contract.payloads import ControlState
-from pebble.extensions.operator.client.forms import Setting
 from pebble.extensions.scripts.runs import SUPERSEDED, following
 from pebble.motion.arbiter import Arbiter
 from pebble.motion.latch import Latch
 from pebble.motion.lease import Lease
 from pebble.services.autonomy_manager.motor_owners import OVERRIDDEN, MotorOwners
-from pebble.services.autonomy_manager.script import Dependency, Script, StartError, plan
+from pebble.services.autonomy_manager.script import Dependency, StartError, plan
 from tests.ext.operator.client.estop_robot import estop_state as state
+from tests.ext.scripts.autonomy_manager.fake_children import script
 
 
 @pytest.fixture
@@ -122,20 +120,13 @@ def test_who_has_control_beside_the_one_who_asks(states: dict[str, tuple[str, st
 # -- whether a start is possible, and the words for why it is not
 
 
-def script(file: str, *dependencies: Dependency) -> Script:
-    settings = (Setting(key="speed", type="float", default=0.5, arg="--speed", max=1),)
-    return Script(
-        file=file, label=file, command=("x",), folder=Path(), settings=settings, dependencies=dependencies
-    )  # fmt: skip
-
-
 SCRIPTS = {
     "walk": script("walk", Dependency("eyes", {"speed": 1})),
     "eyes": script("eyes"),
-    "new": structs.replace(script("new"), asked=False),
+    "new": script("new", asked=False),
     "lost": script("lost", Dependency("nose")),
     "late": script("late", Dependency("new")),
-    "torn": structs.replace(script("torn"), broken="run.py, line 3: invalid syntax"),
+    "torn": script("torn", broken="run.py, line 3: invalid syntax"),
     "fast": script("fast", Dependency("eyes", {"speed": 9})),
     "\u00c5": script("\u00c5"),
     "A\u030a": script("A\u030a"),

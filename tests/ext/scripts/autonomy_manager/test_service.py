@@ -5,37 +5,30 @@ from __future__ import annotations
 import signal
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from pebble.extensions.operator.client.forms import Setting
 from pebble.extensions.scripts.runs import SUPERSEDED
 from pebble.services.autonomy_manager.catalogue import Catalogue
 from pebble.services.autonomy_manager.motor_owners import OVERRIDDEN
 from pebble.services.autonomy_manager.script import Dependency, Script
-from tests.ext.scripts.autonomy_manager.fake_children import Bench, FakeChild
+from tests.ext.scripts.autonomy_manager.fake_children import Bench, FakeChild, script
 from tests.support import WAIT_S, until
 
-SPEED = Setting(key="speed", type="float", default=0.5, arg="--speed", max=1)
 TERM, KILL = signal.SIGTERM, signal.SIGKILL
-
-
-def script(file: str, *dependencies: str, **more: Any) -> Script:
-    needs = tuple(map(Dependency, dependencies))
-    fields = {"label": file, "settings": (SPEED,), "ours": True, **more}
-    return Script(file=file, command=(file,), folder=Path(), dependencies=needs, **fields)
-
 
 SCRIPTS = {
     entry.file: entry
     for entry in (
-        *(script("walk"), script("sing"), script("eyes"), script("wheel"), script("follow", "eyes", "wheel")),
+        *(script("walk"), script("sing"), script("eyes"), script("wheel")),
+        script("follow", Dependency("eyes"), Dependency("wheel")),
         script("old", ours=False),
         script("count", drives=False, label="Count steps"),
-        script("stride", "count", drives=False),
-        script("pace", "walk", drives=False),
+        script("stride", Dependency("count"), drives=False),
+        script("pace", Dependency("walk"), drives=False),
     )
 }
 IDLE = {
@@ -51,9 +44,8 @@ IDLE = {
 
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[Bench]:
-    bench = Bench(tmp_path, SCRIPTS)
-    yield bench
-    bench.close()
+    with closing(Bench(tmp_path, SCRIPTS)) as bench:
+        yield bench
 
 
 def run_of(child: FakeChild) -> int:
@@ -323,12 +315,11 @@ def test_a_run_by_hand_ends_the_script_with_that_reason(bench: Bench) -> None:
 
 
 def test_a_person_may_end_the_script_where_the_config_wants_it(tmp_path: Path) -> None:
-    bench = Bench(tmp_path, SCRIPTS, on_override="stop")
-    walk = bench.start("walk")
-    bench.drive(x=0.1)
-    assert bench.becomes(error=OVERRIDDEN)
-    assert walk.signals == [TERM]
-    bench.close()
+    with closing(Bench(tmp_path, SCRIPTS, on_override="stop")) as bench:
+        walk = bench.start("walk")
+        bench.drive(x=0.1)
+        assert bench.becomes(error=OVERRIDDEN)
+        assert walk.signals == [TERM]
 
 
 def test_a_start_right_after_a_persons_final_zero_is_refused_instead_of_ended_two_seconds_later(bench: Bench) -> None:
@@ -344,8 +335,7 @@ def test_a_start_right_after_a_persons_final_zero_is_refused_instead_of_ended_tw
 
 def test_where_names_are_checked_only_who_has_control_starts_a_script(tmp_path: Path) -> None:
     """Anybody ends one, and a program of the robot, which has no name, starts one."""
-    bench = Bench(tmp_path, SCRIPTS, named=True)
-    try:
+    with closing(Bench(tmp_path, SCRIPTS, named=True)) as bench:
         bench.holder("page-1/ann")
         bench.command({"action": "start", "file": "walk", "by": "otto"})
         assert bench.becomes(error="page-1/ann has control, and starts scripts")
@@ -353,8 +343,6 @@ def test_where_names_are_checked_only_who_has_control_starts_a_script(tmp_path: 
         assert bench.becomes(running=True, file="walk")
         bench.command({"action": "stop", "by": "otto"})
         assert until(lambda: bench.children.all[-1].signals == [TERM])
-    finally:
-        bench.close()
 
 
 @pytest.mark.parametrize(
@@ -381,8 +369,7 @@ def test_a_start_waits_until_its_script_is_listed_unless_something_comes_first(
         found(SCRIPTS)
 
     monkeypatch.setattr(Catalogue, "scan", scan)
-    bench = Bench(tmp_path, None)
-    try:
+    with closing(Bench(tmp_path, None)) as bench:
         bench.owner()
         bench.command({"action": "start", "file": "walk"})
         bench.quiet()
@@ -394,5 +381,3 @@ def test_a_start_waits_until_its_script_is_listed_unless_something_comes_first(
         assert bench.becomes(**status)
         assert len(bench.children.all) == bool(status.get("running"))
         assert len(scans) < 4, "the scripts are listed every three seconds"
-    finally:
-        bench.close()
