@@ -1,4 +1,4 @@
-"""What a base is owed: its lock is opened again, unless it surely is."""
+"""Locks of a ROS 1 base: an opened one is sent again until a base has surely received it."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from goob_imu.imu import Imu
 
 
 def taken(sender):
-    """What is on its way, and it is gone."""
+    """Return what is on its way, and forget it."""
     size = len(sender.ring)
     data = bytes([sender.ring[(sender.first + index) % size] for index in range(sender.used)])
     sender.first = (sender.first + sender.used) % size

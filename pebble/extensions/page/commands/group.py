@@ -210,7 +210,8 @@ def _me() -> str:
 def _run(settings: WebSettings) -> int:
     from pebble.extensions.page.serve import run
 
-    for number in ending_signals()[2:]:  # SIGHUP, the terminal was closed: end as with Ctrl-C, which stops what moves
+    hangups = [number for number in ending_signals() if number.name == "SIGHUP"]  # none on Windows or under nohup
+    for number in hangups:  # the terminal was closed: end as with Ctrl-C, which stops what pages move
         signal.signal(number, lambda *_: signal.raise_signal(signal.SIGINT))
     with until_ended():  # uvicorn raises SIGTERM again once it has ended in order
         run(settings, on_ready=lambda url: _print_ready(settings, url))
