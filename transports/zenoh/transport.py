@@ -29,7 +29,7 @@ from pebble.transports.zenoh.callbacks import direct
 from pebble.transports.zenoh.hub_connection import GOODBYE_S, HUB_ANSWER_S, HubConnection
 from pebble.transports.zenoh.keymap import filter_to_key, key_to_topic
 from pebble.transports.zenoh.loopback_queue import LoopbackQueue
-from pebble.transports.zenoh.presence import Barrier, HubView
+from pebble.transports.zenoh.presence import Barrier, HubView, HubWatch
 from pebble.transports.zenoh.publishers import Publishers
 
 log = logging.getLogger(__name__)
@@ -74,7 +74,8 @@ class ZenohTransport(Transport):
         self.problem = f"no hub answers in {self.settings.run_dir}"
         if not self.settings.client:
             self._start_peer()
-        self._thread = threading.Thread(target=self._run, name=f"pebble-zenoh {self.client_id}", daemon=True)
+        name = f"pebble-zenoh {self.client_id}"
+        self._thread = threading.Thread(target=self._run, args=(self._hub.watch,), name=name, daemon=True)
         self._thread.start()
         sessions.close_at_exit(self)
         self._opened.wait(min(timeout, OPEN_SYNC_S))  # for the siblings; the caller waits for the hub
@@ -89,31 +90,31 @@ class ZenohTransport(Transport):
         except (zenoh.ZError, TransportError) as error:
             presence.release()
             raise TransportError(f"zenoh session of {self.client_id}: {error}") from None
-        if self._begin(session, presence.name):  # False: closed meanwhile
+        if self._begin(self._hub.watch, session, presence.name):  # False: closed meanwhile
             presence.ready()
 
-    def _start_client(self) -> bool:
+    def _start_client(self, watch: HubWatch) -> bool:
         """Try until a hub answers, without which a session in client mode cannot open; True if it has opened."""
         account = self.settings.account
         hub = [] if self.settings.connect else [self.settings.run_dir / sessions.HUB_SOCKET]
         config = sessions.session_config(self.settings, "client", listen=[], connect=hub)
-        while not self._hub.watch.closed:
+        while not watch.closed:
             try:
                 session = sessions.open_session(config)
             except zenoh.ZError as error:
                 log.debug("%s: %s", self.client_id, error)
                 hubs = ", ".join(self.settings.connect) or self.settings.run_dir / sessions.HUB_SOCKET
                 self.problem = f"no hub answers at {hubs}"
-                self._hub.watch.wait_closed(_RETRY_S)
+                watch.wait_closed(_RETRY_S)
                 continue
-            if self._begin(session, f"{account}{wire.OF}{new_name()}" if account else new_name()):
+            if self._begin(watch, session, f"{account}{wire.OF}{new_name()}" if account else new_name()):
                 return True
         return False
 
-    def _begin(self, session: zenoh.Session, name: str) -> bool:
+    def _begin(self, watch: HubWatch, session: zenoh.Session, name: str) -> bool:
         """Use ``session`` from now on: subscribe, and watch its hubs. False if this transport was closed meanwhile."""
         with self._hub.lock:
-            if self._hub.watch.closed:
+            if watch.closed:
                 sessions.close_session(session)
                 return False
             self._hub.name, self.session = name, session
@@ -122,7 +123,7 @@ class ZenohTransport(Transport):
         with self._connecting:
             for subscription in self._subscriptions:
                 self._start(session, subscription)
-        self._hub.watch.follow(session)
+        watch.follow(session)
         return True
 
     def _close(self, will: Message | None) -> None:
@@ -153,22 +154,22 @@ class ZenohTransport(Transport):
 
     # -- the transport's thread: every time a hub appears a new connection begins
 
-    def _run(self) -> None:
-        if self.settings.client and not self._start_client():
+    def _run(self, watch: HubWatch) -> None:
+        """Follow ``watch``, which is closed at the end of this run, and replaced when the transport opens again."""
+        if self.settings.client and not self._start_client(watch):
             return
         version = 0  # of the newest HubView (which hubs are present) that was handled
         linked = 0  # the number of the hub connection that works; 0: none does, and with a hub it is tried again
         self._wait_for_siblings_once()
-        watch = self._hub.watch  # of this run: it is closed at the end, and replaced when the transport opens again
         while (view := watch.wait(version, _RETRY_S if watch.hubs and not linked else None)) is not None:
             try:
                 linked = self._follow(view, version, linked)
             except Exception:  # any error must lead to a reconnect, never end the thread
-                if self._hub.watch.closed:  # the transport is being closed, which may be why
+                if watch.closed:  # the transport is being closed, which may be why
                     return
                 log.exception("%s: unexpected failure of the connection to the hub", self.client_id)
                 linked = 0
-                self._hub.watch.wait_closed(HUB_ANSWER_S)
+                watch.wait_closed(HUB_ANSWER_S)
             version = view.version
 
     def _synchronize(self, timeout: float) -> dict[str, int]:
