@@ -353,6 +353,19 @@ def test_a_stopped_robot_stays_stopped_under_another_name(
     assert files[1].read_text() == FREE, "it was reset"
 
 
+@pytest.mark.parametrize(("file", "left"), [("serial-my-", "serial-my-"), ("front-", "serial-")])
+def test_a_stop_of_a_robot_whose_name_ends_alike_stays(tmp_path: Path, file: str, left: str) -> None:
+    """Both robots share a state directory; *front* was a motor owner of the robot itself."""
+    path, line = tmp_path / "robot.json", {"enabled": True, "serial": {"port": "/dev/null"}}
+    robot, transport = {"system": "pebble", "id": "goob"}, {"kind": "zenoh", "state_dir": str(tmp_path)}
+    path.write_text(json.dumps({"robot": robot, "transport": transport, "services": {"serial_mcu_bridge": line}}))
+    for lock in ("launcher-my-pebble+robots+goob.lock", "launcher-pebble+robots+goob.lock"):
+        (tmp_path / lock).touch()
+    (tmp_path / f"estop-{file}pebble+robots+goob.json").write_text(STOPPED)
+    keep_stops(load(path))
+    assert [path.name for path in tmp_path.glob("estop-*")] == [f"estop-{left}pebble+robots+goob.json"]
+
+
 def test_what_another_robot_retains_stays(robot: Named) -> None:
     robot.start("rover")
     robot.leave()
