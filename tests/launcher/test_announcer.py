@@ -183,13 +183,17 @@ def test_records_that_cannot_be_sent_are_counted(connection: Connection) -> None
     assert connection.pipe.dropped == 3
 
 
-def test_a_state_that_is_too_long_holds_up_no_other(connection: Connection) -> None:
+def test_a_state_that_is_too_long_is_logged_once_and_holds_up_no_other(
+    connection: Connection, caplog: pytest.LogCaptureFixture
+) -> None:
     connection.connect()
-    connection.pipe.state(Message("a", b"x" * ENVELOPE_LIMIT))
+    for _ in range(2):
+        connection.pipe.state(Message("a", b"x" * ENVELOPE_LIMIT))
     connection.pipe.state(Message("b", b"1"))
     connection.pipe.record(Message("logs", b"2"))
     assert connection.received() == [("will", b"gone"), ("state", b"1"), ("record", b"2")]
-    assert connection.pipe.dropped == 1
+    assert connection.pipe.dropped == 2
+    assert caplog.messages == ["a is not published: it has 65611 bytes, and 65536 is the most"]
 
 
 def test_states_are_not_lost_to_a_flood_of_records(connection: Connection) -> None:
