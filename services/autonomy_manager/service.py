@@ -149,6 +149,9 @@ class AutonomyManager(Service):
             raise StoppedError(f"{failed}: {refusal}")
         if self.clock() < self._refused_until:
             raise StartError(f"{failed}: {OVERRIDDEN} just now: start it again in {_HOLD_S:g} s")
+        # If the person never lets go, :meth:`_check_override` would end it: nothing else holds its commands back.
+        if not wanted.main.script.ours and self._person_moves and self.clock() < self._overridden_until:
+            raise StartError(f"{failed}: a person drives: start it again after {_HOLD_S:g} s without a command")
 
     # -- what the motors and people do
 
