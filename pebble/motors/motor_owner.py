@@ -34,7 +34,6 @@ class MotorOwner(Service, ABC):
     halts in its ``start()``, before anything can arrive, and at its end, by :meth:`on_stop`.
     """
 
-    publishes: ClassVar[tuple[c.Channel, ...]] = (c.ESTOP_STATE, c.CONTROL_STATE, c.CONTROL_TURN)
     #: Commands, such as lights, that it carries out with the drive command of the same group (pebble.contract.groups).
     company: ClassVar[tuple[c.Channel, ...]] = ()
 

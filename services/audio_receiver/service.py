@@ -29,7 +29,6 @@ class AudioReceiver(Service):
     """
 
     name = "audio_receiver"
-    publishes = (MEDIA_REPORT,)
     client_name = "local-audio-receiver"
 
     def __init__(self, *arguments: Any, **options: Any) -> None:

@@ -48,7 +48,6 @@ class AutonomyManager(Service):
     """The manager of scripts. ``spawn`` and ``scripts`` replace processes and folders in tests."""
 
     name = "autonomy_manager"
-    publishes = (AUTONOMY_FILES, AUTONOMY_STATUS, DRIVE)
 
     def __init__(
         self, *arguments: Any, spawn: Spawn | None = None, scripts: Mapping[str, Script] | None = None, **options: Any

@@ -33,7 +33,6 @@ class CameraPublisher(Service):
     """The sender of pictures. While the remote broker is away it encodes nothing, and soon reads nothing either."""
 
     name = "camera_publisher"
-    publishes = (MEDIA_REPORT, CAMERA)
     client_name = "local-camera-publisher"
 
     def __init__(self, *arguments: Any, **options: Any) -> None:

@@ -39,11 +39,8 @@ class Leftovers:
 
     def note_local(self, message: Message) -> None:
         on_robot = self._on_robot
-        if on_robot is not None and len(on_robot) <= _TOPICS:
-            if message.payload:
-                on_robot.add(message.topic)
-            else:
-                on_robot.discard(message.topic)
+        if message.payload and on_robot is not None and len(on_robot) <= _TOPICS:
+            on_robot.add(message.topic)
 
     def begin(self) -> None:
         """Start again, because a connection was lost."""

@@ -58,7 +58,6 @@ class MqttBridge(ForwardingService):
     """The bridge: it forwards by Table A.1, once it knows that its two sides are not one broker."""
 
     name = "mqtt_bridge"
-    publishes = (c.ONLINE, c.BRIDGE_PROBE, c.CONTROL_VOUCHED)
     client_name = "local-bridge"
     rules = TABLE_A1
     probed_sides = (Side.REMOTE,)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 from pebble.contract import Channel
 from pebble.contract.payloads import Drive
@@ -15,7 +15,7 @@ from pebble.runtime.service import Service, every
 from pebble.services.ros1_bridge.cmd_vel import SILENT_S, CmdVel
 from pebble.services.ros1_bridge.config import NONE, Ros1
 from pebble.services.ros1_bridge.node import Node
-from pebble.services.ros1_bridge.telemetry import PUBLISHES, Telemetry
+from pebble.services.ros1_bridge.telemetry import Telemetry
 
 _CHECK_S = 0.5
 
@@ -24,7 +24,6 @@ class Ros1Reader(Service):
     """A service that publishes the base's reports, and sends nothing to it."""
 
     name = "ros1_reader"
-    publishes: ClassVar[tuple[Channel, ...]] = PUBLISHES
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -74,7 +73,6 @@ class Ros1Bridge(Ros1Reader, MotorOwner):
     """A service that also drives the base. A stop locks the base's multiplexer, so that no ROS program moves it."""
 
     name = "ros1_bridge"
-    publishes = (*MotorOwner.publishes, *PUBLISHES)
     owner = "ros1"
 
     def __init__(self, *arguments: Any, **options: Any) -> None:

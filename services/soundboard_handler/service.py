@@ -37,7 +37,6 @@ class SoundboardHandler(Service):
     """The player of clips, one at a time: the next one starts when the player of the last one has ended."""
 
     name = "soundboard_handler"
-    publishes = (SOUNDBOARD_FILES, SOUNDBOARD_STATUS)
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)

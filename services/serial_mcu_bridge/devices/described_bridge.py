@@ -8,12 +8,9 @@ from typing import Any
 
 from pebble.contract import (
     GROUP,
-    IMU,
-    IMU_FAST,
     MCU_COMMAND,
     MCU_DESCRIBE,
     MCU_LOCAL_ONLY,
-    MCU_VALUE,
     Channel,
     Kind,
     codec,
@@ -70,7 +67,6 @@ _UID_QUERY = Channel(
 class DescribedBridge(SerialService):
     """The service of one MCU. It publishes the MCU's topics while it is connected, and clears them afterwards."""
 
-    publishes = (MCU_DESCRIBE, MCU_LOCAL_ONLY, MCU_VALUE, IMU_FAST, IMU)
     end = END
     boot_s = 0.0  # bytes that are no frame are skipped
     retry_s = 0.25  # the topics exist within 2 s of plugging in
