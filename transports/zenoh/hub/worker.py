@@ -119,7 +119,7 @@ class HubWorker:
         self._waiting.received(stamp.origin, stamp.retained_count)
 
     def _query(self, query: zenoh.Query) -> None:
-        """Queue a subscriber's query, which names the messages that the answer must include."""
+        """Answer a subscriber's query, at once or when as many messages of each client have come as it names."""
         try:
             needs = wire.decode_counts(_payload(query))
         except (ValueError, msgspec.DecodeError):
