@@ -170,7 +170,7 @@ class HubWorker:
             will = self._store.will(name)
             if will is not None and will.client == hello.will.client:
                 self.forget_will(name)
-                if topic_to_key(will.topic) not in hello.own:
+                if topic_to_key(will.topic) not in hello.own:  # else the client retains a value there, or removed it
                     self._publish_will(name, will)
 
     def _on_bye(self, query: zenoh.Query) -> None:
