@@ -85,7 +85,7 @@ def mutants(file: str, text: bytes) -> Iterator[Mutant]:
             record = {"name": f"{name}:{numbers[name]}", "file": file, "line": part.lineno, "change": change}
             reached_by = {(file, line) for line in (statement_line, *range(part.lineno, part.end_lineno + 1))}
             yield record, reached_by, text[:start] + replacement.encode() + text[end:]
-        # Annotations and decorators are not mutated, nor what is inside a call that logs or an f-string.
+        # Not walked, so not mutated: annotations and decorators, taken out here, and what a log call or f-string holds.
         vars(node).update(annotation=None, returns=None, decorator_list=[])
         if not is_log and not isinstance(node, ast.JoinedStr):
             for child in ast.iter_child_nodes(node):

@@ -36,9 +36,9 @@ class Arbiter:
         self._newest = 0  # the newest run received; all before it are barred
         self._starting = True  # scripts are refused for HOLD_MS, see there
         self._started = now
-        self._held = False  # by a person
+        self._held = False  # scripts wait: a person commanded less than HOLD_MS ago
         self._held_from = now
-        self._resumes = True  # scripts go on after HOLD_MS: the person's last command was a zero, and not final
+        self._resumes = True  # scripts go on after that: the person's last command was a zero, not final (see _take)
         self._scripted = False  # the newest admitted command is a script's, and within its deadline
         self._script_from = now
         self._script_ms = 0

@@ -95,7 +95,7 @@ def deep_merge(under: Any, over: Any) -> Any:
     if not isinstance(under, dict) or not isinstance(over, dict):
         return over
     merged = {key: deep_merge(under.get(key), value) for key, value in over.items()}
-    return merged | {key: value for key, value in under.items() if key not in over}  # last: problems are in file order
+    return merged | {key: value for key, value in under.items() if key not in over}  # last: problems keep over's order
 
 
 def with_instances(raw: Any) -> Any:

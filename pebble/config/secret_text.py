@@ -41,9 +41,9 @@ def without_secrets(text: str) -> str:
     """
     if _AT.search(text):
         text = re.sub(r"\S+", _without_login, _LOGIN_WITH_BLANKS.sub(rf"\1{HIDDEN}@", text))
-    text = _PAIR.sub(rf"\1{HIDDEN}", text) if "=" in text else text
-    hidden = rf"\1\2\3\4{HIDDEN}"  # of the four groups one is not empty
-    return _MEMBER.sub(hidden, _HEADER.sub(rf"\1{HIDDEN}", text)) if ":" in text else text
+    text = _PAIR.sub(rf"\1{HIDDEN}", text) if "=" in text else text  # without "=" it finds none: this saves time
+    text = _HEADER.sub(rf"\1{HIDDEN}", text) if ":" in text else text  # the same
+    return _MEMBER.sub(rf"\1\2\3\4{HIDDEN}", text) if ":" in text else text  # one of the four groups is not empty
 
 
 def _without_login(match: re.Match[str]) -> str:

@@ -131,7 +131,7 @@ def _imu(config: Config) -> tuple[bool, str]:
 
 
 def _outlets(config: Config, features: Collection[str]) -> offers.OutletsOffer:
-    """Return the power outlets of the self-describing MCUs that are connected now, with their topics in use."""
+    """Return the power outlets in use, with their topics. ``features``: ``outlets/NAME/power`` or status of each."""
     topics_of: dict[str, dict[str, str]] = {}  # by the outlet's name
     for key, channel in (("status_topic", c.OUTLET_STATUS), ("command_topic", c.OUTLET_COMMAND)):
         for feature in sorted(features):

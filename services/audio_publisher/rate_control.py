@@ -105,10 +105,10 @@ class LevelControl:
 
     def __init__(self, last: int, now: float) -> None:
         self.level = self._last = last  # which step; 0 is as configured
-        self._slow_since: float | None = None  # since when packets wait too long
-        self._fast_since: float | None = None  # since when none does
+        self._slow_since: float | None = None  # since when packets wait too long (_SLOW_S)
+        self._fast_since: float | None = None  # since when they wait briefly (_FAST_S)
         self._polled_at = float("-inf")
-        self._empty_at = float("-inf")  # when nothing waited
+        self._empty_at = float("-inf")  # when a poll last found that nothing waits (_EMPTY_S)
         self._changed_at = now
         self._raised_at = float("-inf")  # when the quality last rose
         self._calm_s = _FIRST_CALM_S  # how long it has to be fast before a step up

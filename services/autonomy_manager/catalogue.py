@@ -292,15 +292,19 @@ def _inside(root: Path) -> list[Path]:
         return []
 
 
-def _merged(first: Description, second: Description) -> Description:
-    """Return ``first``, with its missing fields taken from ``second``."""
-    keys = {setting.key for setting in first.configs}
+def _merged(manifest: Description, answer: Description) -> Description:
+    """Return a manifest's description, with its missing fields taken from the script's own answer.
+
+    The manifest has no ``command``, else the script is not asked. ``drives`` the caller takes from the answer itself.
+    """
+    keys = {setting.key for setting in manifest.configs}
+    added = [setting for setting in answer.configs if setting.key not in keys]
     return Description(
-        label=first.label or second.label,
-        summary=first.summary or second.summary,
-        main=first.main or second.main,
-        configs=[*first.configs, *(setting for setting in second.configs if setting.key not in keys)][:MAX_SETTINGS],
-        dependencies=first.dependencies or second.dependencies,
+        label=manifest.label or answer.label,
+        summary=manifest.summary or answer.summary,
+        main=manifest.main or answer.main,
+        configs=[*manifest.configs, *added][:MAX_SETTINGS],
+        dependencies=manifest.dependencies or answer.dependencies,
     )
 
 

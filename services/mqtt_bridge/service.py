@@ -357,7 +357,7 @@ class MqttBridge(ForwardingService):
 
     def _follow_control(self, payload: bytes) -> None:
         """Note who has control, and the present key: the time stamp of a command with another key is not judged."""
-        keys = None  # no motor owner gives keys: with any key it is judged
+        keys = None  # without a valid state: the stamp of every command is judged
         with suppress(PayloadError):
             state: ControlState = codec.decode(c.CONTROL_STATE, payload)
             keys = frozenset([state.key.encode()]) - {b""}  # none if no client has control: no stamp is judged
@@ -372,7 +372,7 @@ class MqttBridge(ForwardingService):
 
     def receive_remote(self, epoch: int, message: Message) -> None:
         topic = message.topic if self.names is None else self.names[message.topic].topic
-        if epoch != self.epoch or self._private.stays(topic):
+        if epoch != self.epoch or self._private.stays(topic):  # epoch: it is of an earlier connection
             return
         if topic == self._stop_topic:
             if not self._has_passed(message):  # by the connection for stops alone

@@ -149,7 +149,7 @@ class Dialler:
         after the broker has accepted us, as its retained messages may be large.
         """
         attempt = self.attempt
-        if attempt is None or not isinstance(lost, Silent):
+        if attempt is None or not isinstance(lost, Silent):  # without silence only the first sign is possible
             return isinstance(lost, TlsLate)
         answered_s = attempt.incoming.answered_s
         return attempt.in_flight.lost_bytes > _LARGE or (answered_s is not None and answered_s < _SOON_S)

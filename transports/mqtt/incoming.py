@@ -226,9 +226,9 @@ class Incoming:
         qos = QoS.DELIVERED if first & ANY_QOS else QoS.LATEST
         self.messages.append(Message(text, payload, qos, retain, retain_requested, age.since))
 
-    def skips(self, topic: bytes) -> bool:  # if so it counts the packet, which `on_publication` never gets
+    def skips(self, topic: bytes) -> bool:  # if True, it counts the packet itself: `on_publication` is not called
         if self.messages:
-            return False  # what came before may change the answer
+            return False  # these are to be delivered first: they may change the answer
         try:
             skipped = self._owner.policy.skips_retained(topic)
         except Exception:  # foreign code on our thread

@@ -246,7 +246,7 @@ class Reader:
                     self._data, self._at = b"", 0
                 break
             size, start = data[at + 1], at + 2  # how many bytes follow the length, which has one to four, and where
-            if size > 127 and start < end and (more := data[start]) < 128:
+            if size > 127 and start < end and (more := data[start]) < 128:  # two bytes, the usual length: no call
                 size, start = size & 127 | more << 7, start + 1
             elif size > 127:
                 size, start = _read_variable(data, at + 1)

@@ -235,7 +235,7 @@ class MqttTransport(Transport):
                 is_granted = connection.incoming.as_published
                 if self.as_published and not is_granted:
                     log.warning("%s has no bridge mode: own messages come back on this connection", connection.where)
-                self.as_published = self.exact_echo = is_granted
+                self.as_published = self.exact_echo = is_granted  # if not, own messages come back: no exact echo
             self._serve(connection, run)
             self._finish(connection, run.will)
         finally:
@@ -307,7 +307,7 @@ class MqttTransport(Transport):
         self._dialler.stalled = False
 
     def _query_own(self, connection: Connection, stopping: threading.Event) -> set[str]:
-        """Return the topics of our retained messages that are not sent again: the broker has ours, or rightly another.
+        """Return the topics of our retained messages that are not sent again: the broker has ours, or may have another.
 
         Sets ``went_back`` if it has another value on a topic that only we publish on: an older one. All values have
         arrived when a ping is answered, because they have QoS 0.
@@ -316,7 +316,7 @@ class MqttTransport(Transport):
         with self._publishing:
             messages = {topic: message for topic, message in self._own.items() if topic not in self._own.pending}
             not_accepted = {topic for topic, message in messages.items() if not self._accepts(connection, message)}
-            may_differ = self._own.shared | not_accepted  # others publish there, or ours is refused
+            may_differ = self._own.shared | not_accepted  # there it may: others publish, too, or ours is refused
         retained = self._find(connection, list(messages), stopping)
         if self.will is not None and retained.get(self.will.topic) == self.will.payload:
             del retained[self.will.topic]  # our own will, published although we were running

@@ -245,7 +245,7 @@ class ZenohTransport(Transport):
         with self._publishing:
             owed = bool(self._own.pending or lacking)
             self._sync_retained(self._own.keys() - lacking)  # sends all but these
-            self._hub.put_removals(session, lacking)  # or it may lack their removals
+            self._hub.put_removals(session, lacking)  # what the hub lacks may also be the removal of a message
             return owed
 
     def _refresh(self) -> None:

@@ -46,7 +46,7 @@ def _hub_account(account: Account, held: Iterable[Rule]) -> HubAccount:
     writes = [rule.filter for rule in held if rule.access == "write"]
     is_robot = ProgramRole.ROBOT in account.roles
     wills = [f"{base}/{OUTGOING}/#" for base in account.bases if is_robot]
-    all_topics = [filter_ for filter_ in writes if is_robot and filter_.endswith("/#")]  # so do all of a robot's rules
+    all_topics = [filter_ for filter_ in writes if is_robot and filter_.endswith("/#")]  # a robot's rule: {base}/#
     flags = [filter_ for filter_ in writes if filter_.endswith(_FLAGS)]
     return HubAccount(tuple(wills), tuple(dict.fromkeys((*wills, *all_topics, *flags))))
 

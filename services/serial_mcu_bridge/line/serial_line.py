@@ -136,7 +136,7 @@ class SerialLine:
     # -- any thread
 
     def _hand_over(self, place: Callable[[float], None], line: bytes) -> bool:
-        """Write ``line`` at once on the caller's thread; if it is b"" or has to wait, ``place`` fills the outbox."""
+        """Write ``line`` at once; if it is b"" or has to wait, ``place`` fills the outbox. False: not open."""
         now = time.monotonic()
         with self._lock:
             port, output = self._port, self.output

@@ -119,7 +119,7 @@ class HubWorker:
         self._waiting.received(stamp.origin, stamp.retained_count)
 
     def _query(self, query: zenoh.Query) -> None:
-        """Queue a subscriber's query, which names the messages that the answer must include."""
+        """Answer a subscriber's query, at once or when as many messages of each client have come as it names."""
         try:
             needs = wire.decode_counts(_payload(query))
         except (ValueError, msgspec.DecodeError):
@@ -170,7 +170,7 @@ class HubWorker:
             will = self._store.will(name)
             if will is not None and will.client == hello.will.client:
                 self.forget_will(name)
-                if topic_to_key(will.topic) not in hello.own:
+                if topic_to_key(will.topic) not in hello.own:  # else the client retains a value there, or removed it
                     self._publish_will(name, will)
 
     def _on_bye(self, query: zenoh.Query) -> None:

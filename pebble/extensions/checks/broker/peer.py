@@ -68,7 +68,7 @@ class Peer(packets.Listener):
         self.pongs: list[int] = []  # how many messages had been received at each answer to a ping
         self.code: int | None = None  # of CONNACK
         self.problem = ""
-        self._bytes = 0  # received in messages, and for answers
+        self._bytes = 0  # received in messages; each answer counts as _ANSWER_BYTES
         self._trial, self.base = trial, base
         self._client = Client(opening, self, bridge=bridge)
         self._client.open()

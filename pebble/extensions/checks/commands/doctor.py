@@ -183,8 +183,8 @@ def _broker(settings: MqttSettings, below: str, *, restart: bool, as_json: bool)
     if not as_json:
         for line in words:
             typer.secho(line, bold=True)
-    limits = printer.end(warnings_count=True, assessment=words)
-    return 2 if printer.names("failed") else limits
+    code = printer.end(warnings_count=True, assessment=words)  # 1 for warnings, too: they are limits
+    return 2 if printer.names("failed") else code
 
 
 def _ask_to_restart() -> bool:

@@ -187,7 +187,7 @@ class ViewerQueue:
 
     def rescue(self, now: float) -> None:
         """Move the page to the rescue stream: for a while if it is slow, otherwise until the next key frame."""
-        if self.overflowed or self.is_thin:  # slow; if not, the time of an earlier rescue is over
+        if self.overflowed or self.is_thin:  # slow; else ``_retry_at`` stays in the past: any key frame ends the rescue
             self._retry_at = now + _RETRY_S
         self.rescued = True
         self.wait_for_keyframe()
