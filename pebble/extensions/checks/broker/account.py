@@ -70,12 +70,13 @@ def _rights(trial: BrokerTrial, peer: Peer, topic: str, reads: str, *, must_come
         return failed(text, "pebble fleet check; its role is page")
     peer.subscribe(topic)
     is_back, refusal = _echo(trial, peer, topic)
-    if peer.closed and _takes_qos_0(trial, topic):
+    if peer.closed and _takes_qos_0(trial, topic):  # it hung up on QoS 1 alone
         return warn("takes no QoS 1: what is lost on the way is not sent again", f"{MOSQUITTO}max_qos 2")
     if refusal or (must_come_back and not is_back):
         why = refusal or "it does not come back (or may this account not read it?)"
         fix = f"allow it to write and read {topic.rpartition('/')[0]}/# on the broker"
         return failed(f"this account may not publish to {topic}: {why}", fix)
+    # Where the probe need not come back, one among the commands shows whether the robot receives anything.
     if not must_come_back and (why := _why_deaf(trial, topic.replace("/outgoing/", "/incoming/"))):
         return failed(why, "allow it to read what it subscribes to on the broker")
     return ok("accepts what this account publishes")
