@@ -132,7 +132,7 @@ def _rules(what: str, trial: BrokerTrial, peer: Peer, topic: str) -> CheckResult
         fix = "start it with the files of `pebble fleet init FOLDER --host NAME`, see docs/ext/fleet.md"
         return failed("has no rules: with this account one can pose as any robot, and drive it", fix, what)
     code = peer.acks.get(mid, 0)
-    if code >= REFUSED and not reasons.concerns_login(code):
+    if code >= REFUSED and not reasons.concerns_login(code):  # as "not authorized" does, the answer of a rule
         return warn(f"refuses a message to another robot, but not for that: {reasons.words(code)}", what=what)
     if not is_back and not peer.closed:
         return warn("does not answer in time: whether it has rules is not known", what=what)
