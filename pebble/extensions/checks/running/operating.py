@@ -118,7 +118,7 @@ def retained_commands(robot: RobotUnderTest) -> CheckResult:
     reset of another kind follows, which must be answered: this shows that the silence before was no accident.
     """
     operators = robot.commanding_side
-    if robot.own_side.heartbeats:  # the bridge sends them only to the operators' broker: its own side is at that one
+    if robot.own_side.heartbeats:  # the bridge sends them to the operators' broker alone: so both sides are there
         return skipped("one broker serves both sides: there, what is published to be retained is live at first")
     owner, state = next(iter(robot.view.estop.states.items()), (None, None))
     if owner is None or state is None:
