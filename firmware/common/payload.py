@@ -121,7 +121,7 @@ def _number(text: str) -> float:
     """Return the number in ``text``; 0 if Linux robots see none: a board's float() also accepts 1_0, "." and "e5"."""
     if "nan" in text or "inf" in text:  # refused, as `_axis` refuses them as numbers
         raise ValueError
-    if text.strip("0123456789+-.e") or not text.split("e")[0].strip("+-."):
+    if text.strip("0123456789+-.e") or not text.split("e")[0].strip("+-."):  # another letter, or no digit before e
         return 0.0
     try:
         return float(text)

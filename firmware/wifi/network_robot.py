@@ -137,7 +137,7 @@ class NetworkRobot:
             # A stop counts without an account, too: its topic without one is among the first.
             self.stops.stoppable = results[_ESTOP] <= 127 and granted[_RESET] <= 127
             self.stops.controllable = granted[_CONTROL] <= 127
-            # The topic of groups is the last one. A body that takes none has no ``groups``, whatever is last then.
+            # The last one is the topic of groups, unless the body takes none: then it has no ``groups`` either.
             self.groups = getattr(self.body, "groups", b"") if granted[-1] <= 127 else b""
             self._heartbeats = 0
             self._due = now

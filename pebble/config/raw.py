@@ -73,7 +73,7 @@ def _object(pairs: Pairs, notes: problems.Notes, path: problems.Path) -> dict[st
     data: dict[str, Any] = {}
     for key, value in pairs:
         if key.startswith("//") or (key.startswith("_") and not (path and path[-1] in _OF_NAMES)):
-            continue  # a comment, unless _ begins a name that the owner chose
+            continue  # a comment; but in _OF_NAMES the owner chooses the names, and _ may begin one
         if flaw := hidden(key):
             notes.problem(path, f'has a key "{shown(key)}" that {flaw}')
             continue

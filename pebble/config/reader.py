@@ -90,9 +90,9 @@ class Reader:
         for retired, replacement in kind.all_retired().items():
             if key == retired or (retired.endswith("*") and key.startswith(retired[:-1])):
                 self.notes.retired.append(problems.Note(path, replacement))
-                return key
+                return key  # it has no present name: nothing reads it
         if key in kind.refused:
-            self.notes.problem(path[:-1], f"{key} {kind.refused[key]}")
+            self.notes.problem(path[:-1], f"{key} {kind.refused[key]}")  # of its section: the text has the key
         elif name not in known and kind.holds_others and not problems.near(key, known, _SAME_SECTION):
             self.notes.warning(path, "is not read: nothing that is installed has a section of this name")
         elif name not in known:

@@ -56,9 +56,9 @@ def _without_login(match: re.Match[str]) -> str:
     slashes = _SLASHES.search(word)
     # The first colon with a password after it; the user name before it begins after a sign such as a quote.
     colon = next((colon for colon in _COLON.finditer(word, 0, end) if colon.end() < end), None)
-    if slashes and slashes.end() <= end:
+    if slashes and slashes.end() <= end:  # SCHEME://LOGIN@
         start = slashes.end()
-    elif colon:
+    elif colon:  # NAME:PASSWORD@
         start = max((sign.end() for sign in _BEFORE_USER.finditer(word, 0, colon.start())), default=0)
     else:
         return word

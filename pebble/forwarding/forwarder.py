@@ -210,7 +210,7 @@ class Forwarder:
         """Forward a message whose sender is checked: the name moves from the topic into the payload."""
         sender = names[message.topic]
         subject, by = sender.subject, sender.account  # by: a Signed, below, adds the person for whom the account acts
-        outcome = self.admit(source, subject, message, sender.topic, by != NO_ACCOUNT)  # notes foreign ones, too
+        outcome = self.admit(source, subject, message, sender.topic, by != NO_ACCOUNT)  # notes foreign retained ones
         if subject is None:
             outcome = sender.foreign  # why the topic means nothing to this robot
         elif isinstance(outcome, Forward):
@@ -219,7 +219,7 @@ class Forwarder:
                     outcome = self.retained.change(subject, signed)  # the topic without a name gets it on both sides
                 case Signed(signed, by):
                     outcome = self.pass_on(source, subject, signed, outcome, sender.account)
-                case Drop.UNNAMED if outcome.retain:  # it may be a retained message of the robot itself
+                case Drop.UNNAMED if outcome.retain:  # perhaps the robot's own, as the remote broker has retained it
                     outcome = self.retained.receive(source, subject, message, outcome, only_old=True)
                 case Drop() as drop:
                     outcome = drop
@@ -378,7 +378,7 @@ class Forwarder:
         if self.gate is Gate.SHUT:
             return Drop.CLOSED
         target.events.hold(message)
-        gate = self.sides.gate  # it may have been opened or shut meanwhile, perhaps before this event was there
+        gate = self.sides.gate  # again: who opened or shut it meanwhile may have found the events without this one
         if gate is Gate.OPEN:
             target.events.resume()
         elif gate is Gate.SHUT:

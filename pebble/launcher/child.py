@@ -50,7 +50,7 @@ class Child:
             return
         try:
             os.killpg(self.pid, signal.SIGKILL)
-        except (ProcessLookupError, PermissionError):  # all have ended, or run as another user by sudo
+        except (ProcessLookupError, PermissionError):  # all have ended, or are another user's by sudo: the child alone
             os.kill(self.pid, signal.SIGKILL)
 
     def end(self) -> str:

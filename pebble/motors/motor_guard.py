@@ -121,7 +121,7 @@ class MotorGuard:
         account = self._control.account(drive)
         limit: int = self._arbiter.judge(drive.moves, run, valid_ms, ms(now), key, account)
         self._note_barred(now)
-        if limit == REFUSED:
+        if limit == REFUSED:  # by the latch, the arbiter or the lease, which is asked again for the reason alone
             needs_no_key = run != PERSON or account is None  # a script, or another program of the robot
             is_stranger = self._control.lease.refuses(drive.moves, needs_no_key, key, account or "", ms(now))
             reason = self._reason_of_refusal(drive.moves, is_stranger, now)

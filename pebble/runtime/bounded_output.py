@@ -32,8 +32,8 @@ class BoundedOutput:
         self._tokens, self._filled_at = self._most, now  # lines that may pass now, and when that was computed
         self._newest, self._newest_at, self._repeats = b"", now, 0  # line, without its time, and its repetitions
         self._left_out = 0  # lines that were not written yet, because too many came
-        self._kept: deque[bytes] = deque(maxlen=KEPT)  # the newest of these, which are written after all
-        self._suppressed_at, self._said_at = float("-inf"), now  # when a line was left out, and when that was written
+        self._kept: deque[bytes] = deque(maxlen=KEPT)  # the newest of them: `_say` writes them after all
+        self._suppressed_at, self._said_at = float("-inf"), now  # when a line was last suppressed, and when it was said
 
     @property
     def waits(self) -> bool:

@@ -104,8 +104,8 @@ class AutonomyManager(Service):
             self.log_limited.warning("command", "ignored a command that neither starts nor stops a script")
         elif begin:
             by = command.by if isinstance(command.by, str) else None
-            start = partial(self._start_script, (command.file or "").strip(), command.config or {}, by)
-            start(self.clock() + _LISTED_S)  # until then it may wait for the list of scripts
+            until = self.clock() + _LISTED_S  # until then the start may wait for the list of scripts
+            self._start_script((command.file or "").strip(), command.config or {}, by, until)
         else:
             self._runner.stop()
 

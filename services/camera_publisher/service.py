@@ -172,6 +172,7 @@ class CameraPublisher(Service):
         self._keyframes.require()
 
     def _sent(self, picture: Pixels, payload: bytes, now: float) -> None:
+        """Count a picture that was sent, and watch it on its way: `_poll` then continues until none is in flight."""
         self._rate.sent(wire_size(self._picture_topic, payload), now)
         self.counters.add("sent")
         self._meter.add(now, len(payload))

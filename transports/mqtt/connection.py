@@ -99,7 +99,7 @@ class Connection:
             ending = next((ending for kind, ending in _UNREACHED.items() if isinstance(error, kind)), Lost)
             raise ending(f"{self.where} cannot be reached: {error}") from None
         self.opened_s = time.monotonic() - dialled
-        self.incoming.answered_at = began = clock.since_boot()
+        self.incoming.answered_at = began = clock.since_boot()  # the CONNACK sets it anew
         self.dialling = False
         deadline = time.monotonic() + hosts.CONNECT_TIMEOUT_S
         try:

@@ -183,17 +183,17 @@ class Dialler:
         return was_ended and not was_silent and now - self._gone_at <= _ENDING_S
 
     def failed(self, problem: str, held_s: float) -> tuple[str, bool]:
-        """Go on to the host's next address, unless this broker will be asked once more in another way.
+        """Go on to the host's next address, unless this broker is to be asked once more (bridge mode, other limits).
 
         ``held_s``: how long a connection lasted, or 0. Return the problem in words ("": none yet), and True to log it.
         """
         addresses, asks_again = self.addresses, self.limits.asks_again
-        if self._is_last_attempt and not asks_again:  # it was asked in every way: bridge mode, limits
+        if self._is_last_attempt and not asks_again:  # it was asked in every way, so this address has failed
             why = problem.removeprefix(f"{addresses.where} ")  # the list of failures names the addresses
             failures = addresses.failed(why, held_s)
             if addresses.several:
                 problem = f"broker {addresses.host_port}: {failures}"
-        if asks_again and held_s <= 0:  # the next attempt shows what the problem is
+        if asks_again and held_s <= 0:  # only an attempt has failed: the next one shows what the problem is
             return "", False
         # Of a round through several addresses, only the end is worth a line.
         return problem, held_s > 0 or addresses.is_over or not addresses.several

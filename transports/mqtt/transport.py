@@ -245,7 +245,7 @@ class MqttTransport(Transport):
             self._keep_unconfirmed(connection)
 
     def _serve(self, connection: Connection, run: _Run) -> None:
-        tried_at = time.monotonic() + _TRIED_S  # if the connection ends before that, it shows no limits
+        tried_at = time.monotonic() + _TRIED_S  # only a connection that lasts so long shows the limits
         try:
             self._synchronize(connection, run.stopping)
             if earlier_failures := self._dialler.addresses.succeeded():

@@ -131,11 +131,11 @@ def _config(settings: ZenohSettings, mode: str, listen: list[Path], connect: lis
 
 def _check_endpoint(name: str, endpoint: str, tls: TlsSettings | None) -> None:
     if endpoint.startswith(_LOOPBACK):
-        return
+        return  # it stays on this machine
     if not endpoint.startswith(_SAFE_SCHEMES):
         raise TransportError(f"transport.{name}: {endpoint} leaves this machine unencrypted: use tls/host:port")
     if not endpoint.startswith(_TLS_SCHEMES):
-        return
+        return  # a Unix socket
     if tls is None:
         raise TransportError(f"transport.{name}: {endpoint} needs transport.tls")
     if name == "listen" and tls.ca_cert is None:

@@ -102,9 +102,10 @@ class Audit(Observer):
             with suppress(PayloadError):
                 for member in groups.decode(payload):
                     self.passed(member.channel, by, member.payload)
+            return  # the group itself has no row
         row_of = _COMMANDS.get(channel.suffix)
         if row_of is None and channel.kind not in (Kind.FLAG, Kind.ACTION):
-            return  # a group, too: only its members have rows
+            return
         with suppress(PayloadError):
             if row_of is not None:
                 command = codec.decode(channel, payload)

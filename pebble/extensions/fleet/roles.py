@@ -301,7 +301,7 @@ def _of_rights(
                 yield Rule("write", f"{_ANY}/{INCOMING}/{BY}/{name}/{metric}")
             for base in bases_without_names:
                 yield Rule("write", f"{base}/{INCOMING}/{metric}")
-    if Right.DRIVE in held:  # as a page server, whose account `pebble doctor` checks by probes, which programs ignore
+    if Right.DRIVE in held:  # `pebble doctor` checks a page server's account by a probe here, which no program reads
         yield Rule("write", c.BRIDGE_PROBE.filter(f"+/{SERVERS}/+"))
     if Right.EXPAND in held:
         yield from _of_expander()

@@ -145,7 +145,7 @@ class OpenComponents:
         def take(message: Message, now: float) -> None:
             meaning = self._wanted.get(ref, {}).get(filter_)
             aliases_before = self._robots.aliases(ref)
-            if meaning is None:
+            if meaning is None:  # the topic's name shows component and channel
                 self._robots.receive(message, now)
             elif meaning.channel.kind is c.Kind.FLAG:
                 self._receive_flag(ref, meaning.channel, message)

@@ -88,7 +88,7 @@ class LinkMeter:
 
     At `auto` the level depends on the queue: how much longer answers take than the fastest one. The level falls early
     and rises late: after each rise that fails, the time without a queue before the next rise doubles, up to ten
-    minutes.
+    minutes. ``kbit``: the rate of the link in the config, if any; at `auto` a small one makes the level thin for good.
     """
 
     def __init__(self, profile: str, kbit: float | None = None) -> None:

@@ -117,6 +117,7 @@ def _check_modes(modes: dict[str, bool], options: dict[str, bool]) -> None:
 
 
 def _running(config: Path, places: Places, *, may_move: bool, as_json: bool) -> int:
+    """Test a robot that runs, with ``may_move`` also its wheels, if a person agrees; return the exit code."""
     from pebble.extensions.checks.check import run
     from pebble.extensions.checks.running.checks import CHECKS, MOVING  # of Linux only
     from pebble.extensions.checks.running.robot import become_user_of, reached

@@ -118,7 +118,7 @@ def retained_commands(robot: RobotUnderTest) -> CheckResult:
     reset of another kind follows, which must be answered: this shows that the silence before was no accident.
     """
     operators = robot.commanding_side
-    if robot.own_side.heartbeats:  # the bridge sends them to the operators' broker only: so it is this one
+    if robot.own_side.heartbeats:  # the bridge sends them to the operators' broker alone: so both sides are there
         return skipped("one broker serves both sides: there, what is published to be retained is live at first")
     owner, state = next(iter(robot.view.estop.states.items()), (None, None))
     if owner is None or state is None:
@@ -132,7 +132,7 @@ def retained_commands(robot: RobotUnderTest) -> CheckResult:
         states = [record for record in operators.of(ESTOP_STATE, began) if record.metric == metric]
         return {record.value.reset_refused for record in states if record.value is not None}
 
-    def publish_retained(payload: bytes) -> None:
+    def publish_retained(payload: bytes) -> None:  # by ``beside``, a connection that is made below
         beside.publish(topic, payload, qos=QoS.DELIVERED, retain=True, remember=False)
         robot.wait(lambda: beside.outgoing.waiting == 0, robot.patience_s)
 

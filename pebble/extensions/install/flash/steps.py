@@ -224,7 +224,7 @@ class Steps:
                 self._tools.run(command)
             finally:
                 with suppress(FileNotFoundError):
-                    local.unlink()
+                    local.unlink()  # it has passwords, unlike the certificate
             if private.ca is not None:
                 (self._work / CA_FILE).write_bytes(private.ca)
                 self._tools.run(certificate)

@@ -360,9 +360,9 @@ def _reset(target: Target) -> int:
             return base == robot.base and robot.named
 
         put_account_into_topics(transport, names, is_named)
-        # for ``view.pace`` and ``view.driveable``, the longer one where it delays no answer; times do not matter
+        # LINK is for ``view.pace``, STATUS for ``view.driveable``: the longer one, on the connection without answers
         for channel, connection in ((LINK, receiving), (STATUS, transport)):
-            take = partial(view.receive, channel, now=0.0, wall=0.0)
+            take = partial(view.receive, channel, now=0.0, wall=0.0)  # neither depends on the time
             connection.subscribe(channel.topic(robot.base), take, direct=True)
         receiving.ask(robot.missing)  # stop states: the capabilities that list the owners may just have come
         wait_for(lambda: not robot.missing, _ANSWER_S)

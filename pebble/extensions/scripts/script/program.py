@@ -147,7 +147,7 @@ def _arguments(
         "--describe", action="store_true", help="print the form that operators see, as JSON; only alone"
     )
     chosen, values = parse(options or _NoOptions, sys.argv[1:], parser)
-    if values.describe:  # and something else: alone, `run` has handled it
+    if values.describe:  # not as the only word, which `run` has handled before
         parser.error("--describe goes alone: it prints the form and starts nothing")
     if values.config is None:
         parser.error("which robot? Add its config file, for example: --config goob.json")

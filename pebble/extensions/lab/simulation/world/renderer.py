@@ -107,12 +107,13 @@ class Renderer:
         slope = (self._width / 2 + _BESIDE_PX) / self._focal
         share_from, share_to = np.zeros(len(plan)), np.ones(len(plan))
         # The near plane, then the right and the left edge of the view. Each cuts a surface to the share (0 to 1 of its
-        # length) that is visible. A distance is that of an end, positive on the visible side.
+        # length) that is visible. The distances are those of the surface's two ends, positive on the visible side.
         for distance1, distance2 in (
             (ahead1 - _NEAR_M, ahead2 - _NEAR_M),
             (slope * ahead1 - right1, slope * ahead2 - right2),
             (slope * ahead1 + right1, slope * ahead2 + right2),
         ):
+            # the share at which a surface with its ends on two sides crosses; 0 (unused) if it is parallel
             crossing = distance1 / np.where(distance1 == distance2, np.inf, distance1 - distance2)
             # A surface that is outside as a whole enters at its end, and leaves at its start: nothing is between.
             enters = np.where(distance1 < 0, np.where(distance2 > 0, crossing, 1.0), 0.0)
@@ -234,9 +235,9 @@ def _covers(plan: _Floats, layers: NDArray[np.int_], columns: _Floats) -> NDArra
     normal *= np.where((start * normal).sum(axis=1, keepdims=True) > 0, -1.0, 1.0)  # towards the camera
     # how far each edge of i is in front of the plane of j, negative behind it: [i, edge, j]
     before = np.einsum("iek,jk->iej", plan, normal) - (start * normal).sum(axis=1)
-    most, least = before.max(axis=1), before.min(axis=1)  # of the two edges
-    in_front = (least > -_TOUCHING_M) & (most > _TOUCHING_M)  # of i both edges, one of which may touch the plane of j
-    behind = (most < _TOUCHING_M) & (least < -_TOUCHING_M)  # the same on the other side
+    most, least = before.max(axis=1), before.min(axis=1)  # of the two edges of i: [i, j], as all that follow
+    in_front = (least > -_TOUCHING_M) & (most > _TOUCHING_M)  # i is in front of the plane of j; an edge may touch it
+    behind = (most < _TOUCHING_M) & (least < -_TOUCHING_M)  # i is behind the plane of j; an edge may touch it
     one_plane = (np.abs(before) <= _TOUCHING_M).all(axis=1)
     may_cover = in_front | behind.T  # i is in front of the plane of j, or j is behind the plane of i
     # If each may cover the other, neither does.
