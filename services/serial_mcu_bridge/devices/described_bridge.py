@@ -361,7 +361,7 @@ class DescribedBridge(SerialService):
             self._peers.forget(uid)
         else:
             self._peers.add(uid, frozenset(claims(manifest).granted), self.clock(), retained=retained)
-            if retained:  # ask the device's bridge for the manifest: one that does not come in time, _tick removes
+            if retained:  # let the device's bridge publish it again: if none does so in time, _tick clears it
                 self.publish(MCU_COMMAND, {}, uid=uid, name=RESERVED)
         self.aliases.update()
         self._arm()
