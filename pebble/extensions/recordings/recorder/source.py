@@ -121,7 +121,7 @@ class Source:
     def _receive(self, message: Message) -> None:
         if message.topic.startswith(self._ignored):
             return
-        # With as_published the flag says nothing, but the broker was told to send no old values, see _make.
+        # A retain flag marks an old value; not with as_published, but then the broker sends none, see _make.
         is_live = self._transport.as_published or not message.retain
         if is_live:
             self._recorder.receive(
