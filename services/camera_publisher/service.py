@@ -149,6 +149,7 @@ class CameraPublisher(Service):
             frame.release()
 
     def _send_frame(self, frame: Frame) -> None:
+        """Encode a frame and send it, unless it was overwritten meanwhile or the connection takes no more."""
         picture = self._shape.picture(frame, self._rate.step.size)
         payload = self._encode(picture, frame.info.captured_ms)
         now = self.clock()

@@ -353,6 +353,7 @@ class DescribedBridge(SerialService):
         self.post_message(MCU_DESCRIBE, partial(self._receive_manifest, uid, manifest, message.retain))
 
     def _receive_manifest(self, uid: str, manifest: McuManifest | None, retained: bool) -> None:
+        """Follow the manifests of other devices, whose claims decide about our aliases; restore our own if removed."""
         if self.device is not None and uid == self.device.uid:
             if manifest is None:
                 self.republish()  # another process removed it, for example that of a device with the same uid

@@ -119,6 +119,7 @@ class Source:
             self._recorder.note("lost", why=self.problem, **self._about)
 
     def _receive(self, message: Message) -> None:
+        """Record a message; an old one only where no second connection fetches those."""
         if message.topic.startswith(self._ignored):
             return
         # A retain flag marks an old value; not with as_published, but then the broker sends none, see _make.
@@ -127,7 +128,7 @@ class Source:
             self._recorder.receive(
                 message.topic, message.payload, int(message.qos), message.retain_requested, source=self._name
             )
-        elif self._kind != "mqtt":  # those of a broker are fetched by the other connection
+        elif self._kind != "mqtt":  # see _RetainedFetch
             self._record_retained(message)
 
     def _record_retained(self, message: Message) -> None:
