@@ -175,7 +175,7 @@ def run_and_exit(work: Callable[[], object]) -> NoReturn:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         for descriptor in range(3):
             os.dup2(os.open(os.devnull, os.O_RDWR), descriptor)
-        os._exit(not work())
+        os._exit(not work())  # 0 if it returned what is true
     finally:
         os._exit(1)
 

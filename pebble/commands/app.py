@@ -60,11 +60,11 @@ def run(arguments: list[str]) -> int:
 
 
 def application(words: Sequence[str] = ()) -> Any:
-    """Return the command ``pebble``, which parses a command line; ``words``: as for :func:`commands`."""
+    """Return the command ``pebble``, which parses a command line; ``words``: its beginning, if known."""
     app = typer.Typer(cls=_Pebble, rich_markup_mode=None)
     app.callback()(_options)
     command = typer.main.get_command(app)
-    assert isinstance(command, _Pebble)  # noqa: S101 - cls
+    assert isinstance(command, _Pebble)  # noqa: S101 - by ``cls`` above
     command.offer(commands(words))
     return command
 

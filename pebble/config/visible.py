@@ -15,10 +15,10 @@ def hidden(text: str, *, words: bool = False) -> str:
 
     ``words``: a blank, a tab and a new line may stand anywhere.
     """
-    may_hide = not (text.isprintable() and text.isascii())  # else no character of it needs a look
+    may_hide = not (text.isprintable() and text.isascii())  # printable ASCII hides nothing
     for place, char in enumerate(text if may_hide else ""):
         is_allowed = words and char in "\t\n\r"
-        if not is_allowed and _is_hidden(char) and not _joins(text, place):
+        if not is_allowed and _is_hidden(char) and not _joins(text, place):  # joiners may stay: emoji have them
             return f"holds U+{ord(char):04X}, which is not shown: remove it"
     return "" if words or text == text.strip() else "starts or ends with a blank: remove it"
 

@@ -80,7 +80,7 @@ class Cycles:
         self._ways: dict[tuple[Side, str], _Way] = {}  # by the side from which messages come, and their topic
         self._ours: dict[bytes, Side] = {}  # our probes, and the side each was sent to
         self._others: dict[tuple[Side, bytes], bool] = {}  # probes of other bridges that were relayed; an ordered set
-        self._stops: dict[tuple[Side, bytes], float] = {}  # when each was received last, by side and payload
+        self._stops: dict[tuple[Side, bytes], float] = {}  # when each stop passed last, by side and payload
         #: Messages from this side on this topic come back there if they are forwarded.
         self.closed_ways: Final[set[tuple[Side, str]]] = set()
 
@@ -114,7 +114,7 @@ class Cycles:
             return Finding.SUSPECT if is_suspicious and can_be_probed and is_due else Finding.PASS
 
     def _repeats_stop(self, side: Side, topic: str, payload: bytes) -> bool:
-        """True if a stop comes back faster than a sender repeats it. Counts the stop; stops are not probed."""
+        """True if a stop comes faster than a sender repeats it: it circulates. Counts it; notes when one passes."""
         with self._lock:
             now, key = self._clock(), (side, payload)
             often = self._way(side, topic).count(payload, now) > SUSPICIOUS

@@ -351,7 +351,7 @@ class Forwarder:
             payloads = list(self._pass_stop(source.side, message.payload))
             for payload in payloads:
                 self.publisher.publish(target, subject, Message(message.topic, payload, message.qos), forward)
-            return forward if payloads else Drop.RESET  # all were reset since; or the mirror keeps one owner's copy
+            return forward if payloads else Drop.RESET  # none: it was reset since, or is a copy that a mirror keeps
         if is_event:
             self.publisher.note_return(target, subject, message)
             target.events.send(message)

@@ -28,7 +28,7 @@ class Child:
         try:
             self.notes, notes_end = _pipe(opened)
             self.output, output_end = _pipe(opened)
-            os.set_blocking(output_end, True)
+            os.set_blocking(output_end, True)  # else a program's output would fail while the pipe is full
             descriptors = {"stdin": stdin, "output": output_end, "notes": notes_end}
             self.pid = _fork(lambda: become(program, environment, config, **descriptors))
             self._reaped = False

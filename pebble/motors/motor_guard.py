@@ -70,7 +70,7 @@ class MotorGuard:
         saved = self._file.load()
         if saved is not None:
             self._latch.restore(saved)
-            self._save()  # again: a process that was killed while it wrote may have left what a power cut undoes
+            self._save()  # once more: what a process wrote that was killed meanwhile may not be on the disk yet
         barred = self._barred_file.load()
         if type(barred) is int and 0 < barred <= LAST_RUN:
             self._arbiter.bar(barred)

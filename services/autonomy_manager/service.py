@@ -235,7 +235,7 @@ class AutonomyManager(Service):
             self._local.release()
             raise
         self._signs, self._unsigned_moves = plan.main.script.ours, False
-        for number in self._owners.steps_to(run):  # zeros on the way, or an owner may take this run for an older one
+        for number in self._owners.steps_to(run):  # zeros of numbers in between: else an owner may think it older
             self.halt(number)
         return run, self._owners.baseline()
 

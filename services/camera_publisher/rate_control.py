@@ -189,7 +189,7 @@ class LevelControl:
         load = self._load
         if load > _FULL:
             return self._go_down(load, now)
-        # Good times: one step up would keep the load below _AIM. Otherwise they begin anew.
+        # Good times begin anew while there is no step up, or one that would raise the load above _AIM.
         if self.level == 0 or load * STEPS[self.level - 1].cost / self.step.cost > _AIM:
             self._good_since = now
         elif now - self._good_since >= self._patience:

@@ -149,10 +149,11 @@ class CameraPublisher(Service):
             frame.release()
 
     def _send_frame(self, frame: Frame) -> None:
+        """Encode a frame and send it, unless it was overwritten meanwhile or the connection takes no more."""
         picture = self._shape.picture(frame, self._rate.step.size)
         payload = self._encode(picture, frame.info.captured_ms)
         now = self.clock()
-        # Only black pictures are noted as equal; any other one is noted as the time, which never repeats.
+        # It measures how long a value stays the same: black pictures have one, any other the time, which never repeats.
         self._blackness.take(_BLACK if is_black(picture) else now, now)
         if not frame.valid():
             self._throw_away("overwritten")  # by the next frame, while it was encoded

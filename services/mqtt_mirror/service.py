@@ -90,7 +90,7 @@ class MqttMirror(ForwardingService):
     def _check_broker(self, epoch: int) -> None:
         """Watch for probes of the bridge from the broker for some seconds, and forward nothing before that."""
         self.forwarder.rearm()  # if it was shut: from now on messages wait for the result
-        self._announced, self._under_way = False, bool(self._watched)  # until the bridge says that none is under way
+        self._announced, self._under_way = False, bool(self._watched)  # True with a bridge, until it says that none is
         self.unsubscribe(Side.REMOTE)
         self.subscriptions[Side.REMOTE] = [
             self.remote.subscribe(topic, self._from_broker_watched, echo=False, direct=True)

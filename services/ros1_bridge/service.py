@@ -89,7 +89,7 @@ class Ros1Bridge(Ros1Reader, MotorOwner):
             ros.cmd_vel_publish_interval_seconds,
             None if ros.estop_topic == NONE else ros.estop_topic,
             None if ros.cancel_topic == NONE else ros.cancel_topic,
-            owed=self._lock_file.load() not in (None, False),  # to unlock it: an unreadable file counts as a lock
+            owed=self._lock_file.load() not in (None, False),  # see CmdVel; an unreadable file counts as a lock
             save=self._lock_file.save,
         )
 

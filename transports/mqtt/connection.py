@@ -256,7 +256,7 @@ class Connection:
             client, limits = self.client, self.limits
             if client.socket is None:
                 return False
-            if message.qos is QoS.DELIVERED and self.in_flight.unacked >= UNACKED_LIMIT and self._is_full(message):
+            if message.qos is QoS.DELIVERED and self.in_flight.unacked >= UNACKED_LIMIT and self._is_too_many(message):
                 return False
             # Without QoS 1 nothing is acknowledged: then the bytes that wait are limited.
             if not limits.qos and client.unwritten > _UNWRITTEN and not self._owner.policy.is_stop(message.topic):
@@ -280,7 +280,7 @@ class Connection:
             return True
         return _OVERHEAD + len(message.topic.encode()) + len(message.payload) <= self.max_packet
 
-    def _is_full(self, message: Message) -> bool:
+    def _is_too_many(self, message: Message) -> bool:
         """True if ``message`` is refused at UNACKED_LIMIT, as all are but the next UNACKED_RESERVE emergency stops."""
         beyond = self.in_flight.unacked - UNACKED_LIMIT
         return beyond >= UNACKED_RESERVE or not self._owner.policy.is_stop(message.topic)

@@ -60,13 +60,13 @@ class MqttTransport(Transport):
         if settings.protocol not in ("3.1.1", "5"):
             raise TransportError(f'protocol must be "3.1.1" or "5", not "{settings.protocol}"')
         self.settings = settings
-        self.as_published = settings.as_published  # in bridge mode on 3.1.1, which also keeps own messages away
-        self.exact_echo = settings.as_published or settings.protocol == "5"  # 5 has noLocal for that
+        self.as_published = settings.as_published  # on 3.1.1 by bridge mode, which also keeps our own messages away
+        self.exact_echo = settings.as_published or settings.protocol == "5"  # by bridge mode, or by noLocal of 5
         self._dialler = Dialler(client_id, settings, will, self.client_class)
         self._connection: Connection | None = None  # the newest one, once it can be used
         self._filters = BrokerFilters()
         self._own_message_filter = OwnMessageFilter()
-        self._network: _Run | None = None
+        self._network: _Run | None = None  # the newest run of the network thread
         self._refused = RefusedTopics(client_id, settings.vital)
         self._logged = ("", 0.0)  # the newest problem in the log, and when it went there
 
@@ -157,14 +157,14 @@ class MqttTransport(Transport):
             for ack in acks:
                 ack.wait(deadline - time.monotonic())
 
-    def ask(self, topics: Collection[str]) -> None:  # by an exact subscription to each, until the answer has come
+    def ask(self, topics: Collection[str]) -> None:  # see Transport.ask: subscribes to each of them for a moment
         deadline = time.monotonic() + _ANSWER_S
         with self._filters.lock:
             connection, unheard = self._connection, [topic for topic in topics if topic not in self._filters]
             if connection is None or not unheard:
                 return
             for topic in unheard:
-                self._own_message_filter.subscribe_again(topic)
+                self._own_message_filter.subscribe_again(topic)  # its retained message comes once more
             # Retained messages come after the SUBACK, to all subscriptions that match; the ping's answer follows them.
             answer = connection.subscribe([(topic, self._no_local(topic)) for topic in unheard], QoS.LATEST)
             acks = [answer, connection.ping(), connection.unsubscribe(unheard)]
@@ -188,7 +188,7 @@ class MqttTransport(Transport):
     # -- the network thread
 
     def _run(self, run: _Run) -> None:
-        failures, stopping = 0, run.stopping  # failures before the present one: after the first there is no pause
+        failures, stopping = 0, run.stopping  # failures in a row before this one: after the first there is no pause
         while not stopping.is_set():
             began, problem = time.monotonic(), "failed unexpectedly"
             try:
@@ -212,7 +212,7 @@ class MqttTransport(Transport):
             if self._dialler.addresses.several and not self._dialler.addresses.is_over:
                 continue  # the next address
             pause = min(self.settings.reconnect_max_s, _RETRY_S * 2 ** (failures - 1)) if failures else 0.0
-            if not self._dialler.limits.asks_again:  # a broker that is asked in another way has not failed
+            if not self._dialler.limits.asks_again:  # else it is asked in another way now: that is no failure yet
                 failures = min(failures + 1, 20)  # bounded, because it is an exponent
             stopping.wait(pause * random.uniform(0.5, 1.0))  # noqa: S311  (jitter, no secret)
 
@@ -379,13 +379,13 @@ class MqttTransport(Transport):
             for subscription in subscriptions.matched.get(message.topic) or subscriptions.matching(message.topic):
                 subscription.offer(message, repeat=repeat)
 
-    def note_answers(self, refused: Mapping[str, bool]) -> None:
+    def note_answers(self, refused: Mapping[str, bool]) -> None:  # see Owner: by filter, True if it is refused
         if self._connection is None:
             return  # these answer `_find`, which asks before the connection is used
         subscriptions = list(self._subscriptions)
         for filter_, is_refused in refused.items():
             for subscription in subscriptions:
-                if overlap(subscription.filter, filter_):  # no filter of the broker does but the one that covers it
+                if overlap(subscription.filter, filter_):  # of the broker's filters only the one that covers it does
                     subscription.refused = is_refused
 
     def note_refusal(self, topic: str, why: str) -> None:

@@ -256,7 +256,7 @@ class ZenohTransport(Transport):
             with self._hub.lock:
                 self._hub.renew()  # answers to earlier queries are dropped
                 self._renew()  # all subscriptions: retained messages are delivered again
-            counts = self._synchronize(SYNC_S)  # after _renew: messages received live meanwhile are newer
+            counts = self._synchronize(SYNC_S)  # after _renew: a retained one is dropped if a live one comes first
             self._hub.fetch(self.session, list(self._subscribers), counts)
 
     # -- sending
@@ -317,7 +317,7 @@ class ZenohTransport(Transport):
             self.count_received()
             read_at = clock.since_boot()
             stamp = wire.read_live(sample.attachment)
-            # A sender of the same boot shares our clock: its age counts from the sending. Most need no second look.
+            # since: when it was sent, if that is by our clock (same boot). Younger than late_s is not late.
             since = stamp.sent_ns / 1e9 if stamp.boot == wire.BOOT else None
             if (since is None or read_at - since > late_s) and self._is_late(sample, stamp, read_at):
                 return

@@ -231,7 +231,7 @@ def between(start: Place, end: Place) -> _Movement:
     """Return the movement of a robot that drove an arc, by the places of one tag as seen from its start and its end."""
     before_mm, before_rad = _on_floor_mm(start), start.angle_rad
     after_mm, after_rad = _on_floor_mm(end), end.angle_rad
-    # The chord is half of the turn away from both headings. The tag is equally far beside it at the start and the end:
+    # Both headings differ from the chord's by half of the turn. The tag's distance beside the chord does not change, so
     # before_mm * sin(before_rad + half_turn) == after_mm * sin(after_rad - half_turn).
     half_turn = math.atan2(
         after_mm * math.sin(after_rad) - before_mm * math.sin(before_rad),

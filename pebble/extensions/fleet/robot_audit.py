@@ -135,7 +135,7 @@ class Audit(Observer):
             return
         for what, holder in (("control-ended", before), ("control-given", state)):
             if holder.key:
-                who = holder.by if holder.named and holder.by else f"{holder.by}{_UNCHECKED}"
+                who = holder.by if holder.named and holder.by else f"{holder.by}{_UNCHECKED}"  # "?": no name
                 self.note(what, who, id=holder.id, device=holder.device)
 
     def estop(self, owner: str, state: EstopState) -> None:

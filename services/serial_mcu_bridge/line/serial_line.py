@@ -102,7 +102,7 @@ class SerialLine:
         kind of a second line, such as one for lights, that ``line`` also holds; a waiting line of that kind is dropped.
         """
         outbox = self.output.outbox
-        at_once = line if valid_s > 0 else b""  # else the outbox judges whether it has expired
+        at_once = line if valid_s > 0 else b""  # b"": it may have expired, as the outbox judges
         return self._hand_over(lambda now: outbox.drive(line, now, valid_s, replaces), at_once)
 
     def halt(self) -> bool:

@@ -47,7 +47,7 @@ class ZenohHub:
             from pebble.transports.credentials import renewed_context  # ssl, which few hubs need
 
             self._certificates = renewed_context(settings.tls)
-        self._used = self._newest  # the certificates and rules of the session: first those in the files now
+        self._used = self._newest  # by the session: certificates and rules; before it opens, those in the files
 
     @property
     def refused_wills(self) -> int:

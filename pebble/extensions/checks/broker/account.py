@@ -34,10 +34,10 @@ def robot_account(
 ) -> Iterator[CheckResult]:
     """Publish probe messages below ``base`` and check that the broker accepts them.
 
-    No program takes a probe for anything else. ``reads``: a further filter that the broker must grant. A probe must
-    come back within ``answer_s`` with MQTT 3.1.1, which tells no refusal, or if ``reads`` is given; with MQTT 5 a probe
-    among the commands must, unless it is refused. Above the level ``open``, a probe in the name of another robot must
-    not come back.
+    No program takes a probe for anything else. ``reads``: a further filter that the broker must grant. The probe
+    must come back within ``answer_s`` with MQTT 3.1.1, which tells no refusal, or if ``reads`` is given. Otherwise a
+    second probe must, among the commands, unless it is refused. Above the level ``open``, a probe in the name of
+    another robot must not come back.
     """
     try:
         with reached(settings, "") as trial:  # "": no topic here is below it, as all are complete

@@ -101,8 +101,8 @@ def _end(robot: RobotUnderTest, name: str, before: dict[str, list[str]]) -> str:
     if not view.latched:
         return ""
     for owner, state in view.estop.latched.items():
-        # this stop is not the newest, or another one came before it since ``before``
-        if state.recent[:1] != [name] or not set(state.recent[1:]) <= set(before.get(owner, [])):
+        others, known = state.recent[1:], before.get(owner, [])
+        if state.recent[:1] != [name] or any(other not in known for other in others):  # there are other new stops
             return f"it was stopped by another one meanwhile, and stays so ({state.by or 'unknown'}: {state.why})"
     reset = Reset(view.estop, robot.by)
     send(partial(robot.own_side.transport.publish, urgent=True), reset.messages())

@@ -243,7 +243,7 @@ def certificate(
         if is_hub and not hosts:
             raise FleetError(f"{name} is a hub: name where others reach it, `pebble fleet certificate {name} HOST`")
         taken = set(fleet.accounts)
-        if not is_hub:  # it may run on a broker's machine
+        if not is_hub:  # a hub may have a broker's names, as both may run on one machine
             taken.update(certificates.hosts_of(host for server in fleet.brokers for host in applying.names_of(server)))
         host_names = set(certificates.hosts_of(hosts)) if hosts else set[str]()
         if conflicts := host_names & (taken - {name}):

@@ -331,7 +331,7 @@ class RobotView:
             online=self.online(now),
             latched=self.latched,
             free_s=now - self.reset_at,
-            published=bool(self.capabilities) or self.estop.has_capabilities,
+            published=bool(self.capabilities) or self.estop.has_capabilities,  # also assumed; its own even if empty
             drives=self.drives,
             arbitrates=self.arbitrates,
             script=bool(self.script),

@@ -158,7 +158,7 @@ def _stop(target: Target, why: str, *, every: bool, hold: bool) -> int:
                         "" if transport.state is State.CONNECTED else transport.problem or "no connection"
                     )
                     report.update(time.monotonic())
-                # by the robot's status the report says whether the motors obey: it may come after the confirmation
+                # wait for the robot's status, which may come last: by it the report says whether the motors obey
                 subscribing.join(_ANSWER_S)
                 wait_for(lambda: second.state is State.CONNECTED, _ANSWER_S)
                 _receive(listener, sender, _ON_ITS_WAY_S)

@@ -106,10 +106,10 @@ class TerminalDriver:
         # Answered at once, as no network is between keys and driver: unanswered pings would count as a slow page.
         clock.echo(clock.ping(now), 1000 * now, now)
         view = self._driven.shown(self._tab, now)
-        may_request = self.robot.situation(now).published
+        may_request = self.robot.situation(now).published  # its capabilities are known
         if view.keeps:  # the robot itself decides who drives: nothing is requested before it has published who does
             may_request = self._driven.published is not None
-        if self._willing and may_request and not view.by and not view.asking:
+        if self._willing and may_request and not view.by and not view.asking:  # by: who has control
             self._take(now, over=False)
         self._out += self._driven.update(now)
         self._reason = f"no connection: {problem}" if problem else self._why_not(now)

@@ -389,10 +389,10 @@ class DrivenRobot:
     def _zero(self, tab: Tab, op: DriveOp, now: float) -> list[Command]:
         """Return a zero to publish, which is sent in every state. It ends this gesture and the page's earlier ones."""
         tab.end_until(op.g)
-        if tab.moves is self and op.g >= tab.gesture:
+        if tab.moves is self and op.g >= tab.gesture:  # it moves by one of these gestures
             self._on(Event.LETS_GO, now)
         commands = tab.interrupt(op.g, now)  # zeros of another robot, if the page moves that by this gesture
-        if self._is_assumed:  # while such a board connects anew, only a later zero stops it
+        if self._is_assumed:  # a silent board that connects anew is stopped only by a zero after that
             self._repeat_zeros(now)
         # Unless it is ``final`` (see DriveOp), the driver has let go: an interrupted script may resume.
         is_release = self.tab is tab and not op.final

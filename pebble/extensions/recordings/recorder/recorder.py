@@ -81,9 +81,10 @@ class Recorder:
     ) -> None:
         """Queue a message. ``retained``: an old value, which the broker sent for a new subscription.
 
-        ``qos``, ``retain``: as it was published; None if unknown.
+        ``qos``, ``retain``: as it was published; None if unknown. ``source``: the name of its connection, if there are
+        several.
         """
-        if topic.startswith("$recorder/") or len(payload) > LARGEST_PAYLOAD:
+        if topic.startswith("$recorder/") or len(payload) > LARGEST_PAYLOAD:  # such topics are the recorder's own
             self.counters["refused"] += 1
         elif self.options.media or not is_media(payload):
             self._intake.add(topic, payload, qos, retain, "1" if retained else "", source)  # see Item.retained
