@@ -299,7 +299,7 @@ def _confirmed(_robot: Observer, _name: str) -> CheckResult:
 def _after_long_ones(robot: Observer) -> CheckResult:
     """Check that a stop still reaches the robot after messages that are too long for small boards."""
     stops_it = while_stopped(_confirmed)
-    if stops_it(robot).state is not State.OK:  # if it is, the robot has read everything that was sent before
+    if stops_it(robot).state is not State.OK:  # OK: it has read all that was sent before
         return skipped("no stop reaches it without them, either")
     for _ in range(_BURSTS):
         for _ in range(_LONGS):
