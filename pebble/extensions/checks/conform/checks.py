@@ -319,6 +319,7 @@ def _repeated(robot: Observer) -> CheckResult:
     stop_names: list[str] = []  # the name that while_stopped chose
 
     def send_same_stop(robot: Observer, name: str) -> CheckResult:
+        """Check that the stop called ``name``, which the robot knows already, is not counted again."""
         stop_names.append(name)
         before = _counts(robot)
         robot.send(c.ESTOP, EstopCommand(stop=name, by=BY, why=_WHY))
