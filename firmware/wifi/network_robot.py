@@ -161,7 +161,7 @@ class NetworkRobot:
                 stops.request(raw, sender, topic == _TAKE, now)
         elif not stops.stoppable:  # without a way to reset it, a stop is only a zero
             if topic == _ESTOP:
-                stops.arbiter.judge(False, PERSON, 0, now)
+                stops.arbiter.judge(False, PERSON, 0, now)  # as a zero of a person
                 self._halt()
         elif topic == _ESTOP:
             if stops.stop(raw, by, self._clock.read(now)):

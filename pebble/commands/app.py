@@ -50,9 +50,9 @@ def commands(words: Sequence[str] = ()) -> dict[str, Offered]:
 def run(arguments: list[str]) -> int:
     """Run a command line; return the exit code, 2 if it is wrong. Raises PebbleError."""
     for extension in ours():
-        for former, now in extension.former.items():
+        for former, now in extension.former.items():  # a command of earlier versions, and its successor
             if arguments[: len(former.split())] == former.split():
-                command = now.partition(" --")[0]
+                command = now.partition(" --")[0]  # without options, which its help explains
                 sys.stderr.write(f'pebble: "{former}" is now "{now}": pebble {command} --help\n')
                 return 2
     with _thread_errors_on_stderr():

@@ -54,7 +54,7 @@ def plain(raw: Any, notes: problems.Notes, path: problems.Path = ()) -> Any:
     if len(path) > _DEEPEST:
         notes.problem(path[:2], f"is nested more than {_DEEPEST} levels deep")
         return None
-    if isinstance(raw, dict):
+    if isinstance(raw, dict):  # made by a program, not by `decode`
         raw = Pairs(raw.items())
     if isinstance(raw, Pairs):
         return _object(raw, notes, path)
@@ -63,7 +63,7 @@ def plain(raw: Any, notes: problems.Notes, path: problems.Path = ()) -> Any:
     if isinstance(raw, float) and not math.isfinite(raw):
         notes.problem(path, f"must be a number, not {raw}")
         return None
-    if isinstance(raw, str) and (flaw := hidden(raw, words=_is_words(path))):
+    if isinstance(raw, str) and (flaw := hidden(raw, words=_is_words(path))):  # not shown, or a blank at an end
         notes.problem(path, flaw)
         return ""
     return raw

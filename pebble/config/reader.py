@@ -149,7 +149,7 @@ class Reader:
         tells_nothing = shown == "text" and (get_origin(kind) is Literal or kind in (str, Path))
         must_be = f"must be {expected(kind, metas)}" + ("" if tells_nothing else f", not {shown}")
         reading = reading_of(annotation, kind, metas, raw, default) if self._other_forms else None
-        if reading is not None and reading.differs:
+        if reading is not None and reading.differs:  # another value, with a warning
             is_set = bool(reading.value) or reading.value == 0  # 0 and false are values
             used = f"{msgspec.json.encode(reading.value).decode()} is used" if is_set else "it counts as not set"
             self.notes.warning(path, f"{must_be}; {used}")

@@ -35,17 +35,17 @@ def shown(text: str) -> str:
     """
     if text.isascii() and text.isprintable():
         return text
-    return "".join(_coded(char) if _steers(text, place) else char for place, char in enumerate(text))
+    return "".join(_coded(char) if _needs_code(text, place) else char for place, char in enumerate(text))
 
 
-def _steers(text: str, place: int) -> bool:
-    """True if the character at ``place`` is neither seen nor a blank: it may reorder text, or control a terminal."""
+def _needs_code(text: str, place: int) -> bool:
+    """True if the character at ``place``, invisible and no blank, might reorder text or control a terminal."""
     import unicodedata
 
     char = text[place]
     if char in "\t\n" or not _is_hidden(char) or _joins(text, place):
         return False
-    return unicodedata.category(char) != "Zs"
+    return unicodedata.category(char) != "Zs"  # a blank
 
 
 def _coded(char: str) -> str:

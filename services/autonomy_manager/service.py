@@ -87,7 +87,7 @@ class AutonomyManager(Service):
         if not self._connected_before:
             self._connected_before = True
             self.listen(CONTROL_STATE, self._control)
-            try:  # a predecessor may have been killed with its script: a zero of a newer run bars that
+            try:  # a killed predecessor's script may still drive: the zero of a newer run bars its run
                 self.halt(next_run(self.config, self._owners.barred))
             except PebbleError as error:
                 self.log.error("%s", error)

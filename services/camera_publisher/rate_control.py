@@ -223,7 +223,7 @@ class LevelControl:
         if self._rose_at is not None and now - self._rose_at < _PROBATION_S:
             self._patience = min(_LONGEST_PATIENCE_S, max(_PATIENCE_S, 2 * self._patience))
             if load <= 2 * _FULL:
-                affordable = self.step.cost  # only one step down, to where it came from; above, as far as necessary
+                affordable = self.step.cost  # one step down, to where it came from; at a higher load further
         self._rose_at = None
         level = next((level for level in lower if STEPS[level].cost <= affordable), len(STEPS) - 1)
         return self._change(level, now)

@@ -101,12 +101,12 @@ class CameraPublisher(Service):
 
     def _open_encoder(self, name: str) -> VideoEncoder:
         options = self._options
-        # An interval meant for JPEGs would make H.264 three times as large.
-        applies = name != "h264" or options.encoding == "h264"
+        # Unless the config is for H.264, its interval is meant for JPEGs, and would make H.264 three times as large.
+        uses_interval = name != "h264" or options.encoding == "h264"
         return make_encoder(
             name,
             fps=self._fps,
-            keyframe_interval=options.keyframe_interval if applies else None,
+            keyframe_interval=options.keyframe_interval if uses_interval else None,
             quality=options.jpeg_quality,
         )
 

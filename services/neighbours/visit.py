@@ -96,7 +96,7 @@ class Visit:
         number = None
         if not why:
             barred = newest(state.last_barred for state in self._states.values())
-            number = self._number(barred, self._received)
+            number = self._number(barred, self._received)  # None while a script of this robot runs
         if number is None:
             refusal = self._refused.get(name)
             if refusal is None or refusal.run != run:  # of one run the first reason is kept

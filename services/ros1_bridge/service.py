@@ -80,7 +80,7 @@ class Ros1Bridge(Ros1Reader, MotorOwner):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         ros = self.section.ros
-        self._lock_file = StateFile(self.config.state_file(f"lock-{self.owner}"))
+        self._lock_file = StateFile(self.config.state_file(f"lock-{self.owner}"))  # whether it has locked the base
         self._reported = Reported(self.notifier.mcu)
         self._shown: object = None  # the report of the base that was logged last
         self.cmd_vel = CmdVel(

@@ -185,7 +185,7 @@ class Connection:
             if owes:
                 with self._lock:
                     client.acknowledge()
-        incoming.age.delay.delivered()  # even if there were none: what came before a ping's answer is handled now
+        incoming.age.delay.delivered()  # also without messages: what came before a ping's answer is handled now
         if incoming.age.has_retained:  # their handlers may have taken long: the broker was not silent meanwhile
             incoming.age.note_handled()
         if self.in_flight.answered:

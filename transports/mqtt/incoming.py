@@ -78,7 +78,7 @@ class Incoming:
         if self.accepted is None:
             return  # `connect` has its own deadline, and gives the first round trip
         silent_s = now - max(self.answered_at, self.age.arriving_at)
-        if silent_s > self.silence_s and silent_s > (limit := self.pings.silence_limit_s):  # never less; slower to get
+        if silent_s > self.silence_s and silent_s > (limit := self.pings.silence_limit_s):  # the quick limit first
             self._counters.add("silences")
             raise Silent(f"{self.where} has not answered for {limit:.1f} s")
 

@@ -343,10 +343,10 @@ class Reader:
             self._keep(start + HEAD - at)
             return
         topic_end = start + 2 + int.from_bytes(data[start : start + 2], "big")
-        ack = b"\x40\x02" + data[topic_end : topic_end + 2] if data[at] & ANY_QOS == _QOS_1 else b""
+        ack = b"\x40\x02" + data[topic_end : topic_end + 2] if data[at] & ANY_QOS == _QOS_1 else b""  # PUBACK
         self._too_long = data[start + 2 : topic_end], stop - start, ack
         self._discarded, self._data, self._at = stop - at, b"", 0
-        self.feed(data[at:])
+        self.feed(data[at:])  # discards what is here of the packet, and keeps what follows it
 
     def _discard(self, data: bytes) -> bytes:
         """Discard bytes of a long packet; return those after it."""

@@ -143,16 +143,16 @@ class MqttTransport(Transport):
         with self._filters.lock:
             connection = self._connection
             for subscription in subscriptions:
-                filter_, replaced = self._filters.add(subscription.filter)
+                filter_, replaced = self._filters.add(subscription.filter)  # a wider filter may replace others
                 if connection is not None:
-                    self._own_message_filter.subscribe_again(filter_)
+                    self._own_message_filter.subscribe_again(filter_)  # retained messages are sent once more
                     acks.append(connection.subscribe([(filter_, self._no_local(filter_))]))
                     acks.append(connection.unsubscribe(replaced))
             if connection is None:
                 return  # the next connection subscribes to them
             # Retained messages come after the SUBACK, on a bad network long after it; a ping's answer follows them.
             acks.append(connection.ping())
-        if self._network is None or threading.current_thread() is not self._network.thread:  # the reader of the answers
+        if self._network is None or threading.current_thread() is not self._network.thread:  # which reads the answers
             deadline = time.monotonic() + _ANSWER_S
             for ack in acks:
                 ack.wait(deadline - time.monotonic())

@@ -121,7 +121,7 @@ class ZenohTransport(Transport):
         self._barrier = Barrier(session, name, lambda: self._hub.retained_count, by_name=self._elsewhere)
         with self._connecting:
             for subscription in self._subscriptions:
-                self._start(session, subscription)
+                self._make_subscriber(session, subscription)
         self._hub.watch.follow(session)
         return True
 
@@ -178,10 +178,10 @@ class ZenohTransport(Transport):
         counts, `HubConnection.fetch` lets the hub answer only after these. Siblings on other machines (`_elsewhere`)
         are in no run directory here, so only the hub is waited for.
         """
-        if self._barrier is None:
+        if self._barrier is None:  # no session has begun
             return {}
 
-        def expected() -> dict[str, str]:
+        def expected() -> dict[str, str]:  # by name: what each is, for logs
             siblings = {} if self._elsewhere else self._siblings.ready(but=self._hub.name)
             return siblings | dict.fromkeys(self._hub.watch.hubs, "the hub")
 
@@ -232,7 +232,7 @@ class ZenohTransport(Transport):
             lacking = self._hub.greet(session, hello, remaining_s)
             if lacking is None:
                 return False
-            if not self._send_lacking(session, lacking - sent):  # the hub has all, or no room for what was sent before
+            if not self._send_lacking(session, lacking - sent):  # nothing left: the hub has all, or no room for `sent`
                 return True
             sent |= lacking
         return False
@@ -294,7 +294,7 @@ class ZenohTransport(Transport):
                 return  # they are declared when there is a session
             with contextlib.suppress(zenoh.ZError):  # closed meanwhile: then nothing is received any more
                 for subscription in subscriptions:
-                    self._start(session, subscription)
+                    self._make_subscriber(session, subscription)
                 counts = self._synchronize(SYNC_S)
                 if self._state is State.CONNECTED:
                     self._hub.fetch(session, subscriptions, counts)
@@ -305,7 +305,7 @@ class ZenohTransport(Transport):
             with contextlib.suppress(zenoh.ZError):  # closed meanwhile
                 subscriber.undeclare()  # type: ignore[no-untyped-call]
 
-    def _start(self, session: zenoh.Session, subscription: Subscription) -> None:
+    def _make_subscriber(self, session: zenoh.Session, subscription: Subscription) -> None:
         if subscription in self._subscribers:
             return
         origin = zenoh.Locality.ANY if subscription.echo else zenoh.Locality.REMOTE
@@ -317,7 +317,7 @@ class ZenohTransport(Transport):
             self.count_received()
             read_at = clock.since_boot()
             stamp = wire.read_live(sample.attachment)
-            # since: when it was sent, if that is by our clock (same boot). Younger than late_s is not late.
+            # A sender of this boot shares our clock: the age is known. Only if it is high, or unknown, ask `_is_late`.
             since = stamp.sent_ns / 1e9 if stamp.boot == wire.BOOT else None
             if (since is None or read_at - since > late_s) and self._is_late(sample, stamp, read_at):
                 return

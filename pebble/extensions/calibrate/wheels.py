@@ -60,7 +60,7 @@ def calibrate(robot: Robot, person: Person, wanted: Wanted, clock: Callable[[], 
     """Drive all runs, fit the wheels, and write ``odometry.json`` beside the config. Raises PebbleError, Stopped."""
     check(wanted)
     path = robot.config.folder / CALIBRATION
-    write(path.with_suffix(".try"), b"", 0o644, PebbleError)  # now, not after all runs
+    write(path.with_suffix(".try"), b"", 0o644, PebbleError)  # raises before the runs if nothing can be written there
     path.with_suffix(".try").unlink()
     session = _Session(robot, person, wanted, clock)
     result = session.run()

@@ -140,8 +140,9 @@ class Audit(Observer):
 
     def estop(self, owner: str, state: EstopState) -> None:
         """Add a row if the owner has refused a reset; its state shows only why it has refused the last one."""
-        why, before = state.reset_refused, self._refusals.get(owner, state.reset_refused)
-        is_answer = owner in self._awaited
+        why = state.reset_refused
+        before = self._refusals.get(owner, why)  # the first state that is seen may tell of an old refusal
+        is_answer = owner in self._awaited  # to the newest reset that passed here
         is_of_another = why == "boot" and len(self._owners) > 1  # a reset is for one owner's boot: all others refuse it
         self._refusals[owner] = why
         self._awaited.discard(owner)

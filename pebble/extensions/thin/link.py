@@ -200,7 +200,7 @@ class Room:
         self._was_full = False
 
     def takes(self, rank: Rank, size: int, now: float) -> bool:
-        """Return True if ``size`` bytes of this rank may be sent now, and note them.
+        """Return True if ``size`` bytes of this rank may be sent now, and note them; with 0 it only asks.
 
         One message may always be on its way; if it is larger than the room, it fills it. Higher ranks may use several
         times the room, so they need not wait for such a message of a lower rank.

@@ -44,8 +44,8 @@ class LinkReport:
 
     def __init__(self, meter: LinkMeter, address: Address, remote: Transport) -> None:
         self._meter, self._address, self._remote = meter, address, remote
-        self._level, self._crowded, self._queue_s = "", False, 0.0  # as published last
-        self._at = -inf
+        self._level, self._crowded, self._queue_s = "", False, 0.0  # as published last; crowded: a queue stands
+        self._at = -inf  # when that was
 
     @property
     def is_outdated(self) -> bool:

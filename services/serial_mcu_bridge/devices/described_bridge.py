@@ -342,7 +342,7 @@ class DescribedBridge(SerialService):
         if uid is None:  # the filter's + also matches an empty level
             self.counters.add("refused")
             return
-        manifest = None
+        manifest = None  # of an empty message: the manifest was removed
         if message.payload:
             try:
                 manifest = codec.decode(MCU_DESCRIBE, message.payload)

@@ -125,7 +125,7 @@ class ZenohHub:
 
     def _listen(self, worker: HubWorker) -> None:
         self._session = None
-        siblings = PeerRegistry(self._settings.run_dir).sockets()  # we connect at once; they take up to 0.5 s
+        siblings = PeerRegistry(self._settings.run_dir).sockets()  # to connect to: their next try may be 0.5 s away
         try:
             settings = replace(self._settings, listen=tuple(filter(self._is_free, self._settings.listen)))
             rules = self._admission.rules()

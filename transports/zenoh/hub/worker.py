@@ -58,7 +58,7 @@ class HubWorker:
         session.declare_subscriber(wire.RETAINED + "**", retain, allowed_origin=zenoh.Locality.REMOTE)
         session.declare_queryable(wire.RETAINED + "**", direct(partial(self._intake.ask, self._query)), complete=True)
         for what, work in ((wire.HELLO, self._on_hello), (wire.BYE, self._on_bye)):
-            for key in (what, f"{what}/*"):
+            for key in (what, f"{what}/*"):  # without an account, and with one
                 session.declare_queryable(key, direct(partial(self._intake.greet, work)))
         note_client = direct(lambda sample: self.post(partial(self._on_client, sample)))
         session.liveliness().declare_subscriber(wire.LIVE + "*", note_client, history=True)

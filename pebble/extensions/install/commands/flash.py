@@ -74,7 +74,7 @@ def flash(
         for warning in config.warnings:
             typer.echo(f"warning: {warning}", err=True)
     password_variables = () if config is None else config.password_variables
-    withhold((WIFI_PASSWORD, *password_variables))
+    withhold((WIFI_PASSWORD, *password_variables))  # from the programs that are started below
     if dry_run:
         show_steps(options, Tools(), typer.echo)
         return 0

@@ -110,7 +110,7 @@ class RobotView:
         self.remembered: dict[str, Message] = {}  # by topic: what an emergency stop that begins later needs to know
         self.capabilities: dict[str, Any] = {}
         self.parked = False  # its broker retains a drive command: it moves a board whenever that connects
-        self._status = b""  # the newest
+        self._status = b""  # the payload of its newest status
         self.link: LinkState | None = None  # what the way to its broker carries; None: everything
         self.autonomy: AutonomyStatus | None = None
         self.volts: float | None = None

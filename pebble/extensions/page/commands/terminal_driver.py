@@ -176,7 +176,7 @@ class TerminalDriver:
         self._pressed = moves or (self._pressed and now - self._key_at < HELD_S)
         if moves or self._driven.state is State.MOVING:
             op = DriveOp(ref=self.robot.base, g=self._gesture, t=1000 * now, x=x, z=z, y=y)
-            self._out += self._driven.drive(self._tab, op, now, self._reason)[0]
+            self._out += self._driven.drive(self._tab, op, now, self._reason)[0]  # without why, if it is refused
 
     def _why_not(self, now: float) -> str:
         """Return why the robot cannot be driven; empty if it can."""

@@ -339,10 +339,10 @@ class DrivenRobot:
         # ``decided`` is the present key of control: empty if control is lost, another one if it was given once more.
         if had_control and client.decided != self._given_key:
             commands = self._on(Event.LOST, now)
-        if client.held and self.client is not client:
+        if client.held and self.client is not client:  # for the first time, or after the loss above
             commands += self._give(tab, client, now)
             wish.granted()
-        if client.failed:
+        if client.failed:  # why the request has failed
             if not had_control:  # a page that loses control is shown the new driver instead
                 wish.failed(client.failed)
             client.failed = ""

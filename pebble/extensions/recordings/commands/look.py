@@ -144,6 +144,7 @@ def _lane(path: Path) -> str:
 
 
 def _state(info: FileInfo) -> str:
+    """Return what distinguishes a file from a finished, undamaged one, the most telling of it; "" if nothing does."""
     if info.is_active:
         return "being written"
     if info.missing:

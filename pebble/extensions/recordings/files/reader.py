@@ -82,7 +82,7 @@ class RecordingFile:
         self.is_ours = True  # written by Pebble, which numbers messages; also if a damaged header does not tell
         self.statistics: Statistics | None = None  # None: the file is not finished, or its summary is incomplete
         self._schemas: dict[int, Schema] = {}
-        self._metadata: list[int] = []  # positions of these records
+        self._metadata: list[int] = []  # positions of the records of metadata
         self._scan = Scan(self._read, self.damage)
         self._recent = lru_cache(_KEPT)(partial(self._unpacked, chooses=lambda _channel: True))
         try:

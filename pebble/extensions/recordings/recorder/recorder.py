@@ -133,14 +133,14 @@ class Recorder:
         if flushing:
             self._writing.note_drops()
         if stopping:
-            self._writing.try_again()
+            self._writing.try_again()  # if files could not be written
         for item in self._intake.take():
             self._writing.add(item)
         if flushing:
             self._writing.flush()
             self._writing.rotate(all_of_them=stopping)
         if stopping:
-            self._writing.give_up()
+            self._writing.give_up()  # what still cannot be written
 
     def _follow_clock(self, due: Due) -> None:
         suspended_s = due.suspended_s(self._clocks.awake_ns())

@@ -150,7 +150,7 @@ class _RetainedFetch:
         self._transport = create("mqtt", "pebble-recorder-retained", plain)
         self._transport.on_state(self._watch)
         self._transport.open(0.0)
-        for filter_, receive in _once(filters, self._receive):
+        for filter_, receive in _once(filters, self._receive):  # each message counts once
             self._transport.subscribe(filter_, receive, direct=True)
 
     @property

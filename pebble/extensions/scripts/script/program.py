@@ -166,7 +166,7 @@ class _Program:
         self._robot: Robot | None = None
 
     def run(self, main: Callable[..., None], config_path: Path, arguments: tuple[msgspec.Struct, ...]) -> None:
-        Guard(self._end_on_signal)
+        Guard(self._end_on_signal)  # its own thread ends the run at a signal
         config = load(config_path, lenient=True)  # as the launcher does, which runs the robot
         LocalScripts(config).hold()  # until the process ends
         transport = _connected(config, config_path)
