@@ -43,12 +43,12 @@ class SoundboardHandler(Service):
         super().__init__(*arguments, **options)
         self._section = self.config.section(SoundboardHandlerSection)
         self._clips = Clips(self._section.playback.directory or in_home("~/sounds"))
-        self._listed: list[str] | None = None
-        self._scan_problem = ""
+        self._listed: list[str] | None = None  # the names of clips as published last
+        self._scan_problem = ""  # why the folder could not be read, as logged last
         self._playback: Playback | None = None
-        self._started_at = 0.0
+        self._started_at = 0.0  # when a player last started
         self._request: _Request | None = None  # what is played now, or will be when the player has ended
-        self._error: str | None = None
+        self._error: str | None = None  # why the last clip was not played, or not to its end
         self._talk_back_at = -math.inf  # when audio_receiver last reported that it plays
 
     def start(self) -> None:
@@ -129,7 +129,7 @@ class SoundboardHandler(Service):
         """Play the waiting request, if there is one."""
         self._playback = None
         if self._request is not None:
-            self._request.starts += 1
+            self._request.starts += 1  # until it was played ``times`` times, see _changed
             self._playback = Playback(self._request.clip, self.config, self.post_first, self._changed)
             self._playback.start()
         else:
