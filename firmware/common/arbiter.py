@@ -106,8 +106,8 @@ class Arbiter:
     def _take(self, moves: bool, final: bool, now: int) -> None:
         """Handle a person's command: scripts wait, or end. ``final``: a zero ends them in any case.
 
-        A zero that is not ``final`` ends a script only if the script was driving until now. A script that waits already
-        after an earlier command of the person goes on HOLD_MS after the zero, which ends only the person's driving.
+        A zero that is not ``final`` ends a script only if the script was driving until now. If the person was driving,
+        the script waits already: the zero ends the person's driving, and the script goes on HOLD_MS later.
         """
         if not moves and (final or self._scripted):
             self.bar(self._newest)

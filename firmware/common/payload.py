@@ -80,7 +80,7 @@ def _run(body: dict, stops: bool) -> int:
     if run is not None and not (type(run) is int and 1 <= run <= LAST_RUN):
         run = UNKNOWN_RUN
     if not stops and (run == UNKNOWN_RUN or not (source is None or isinstance(source, str))):
-        raise ValueError
+        raise ValueError  # a wrong run, or a wrong source
     if source != "autonomy":  # any other source is a person
         return PERSON
     if run is None:

@@ -151,7 +151,7 @@ def _run(arguments: list[str]) -> int:
         code = application(arguments).main(arguments, prog_name="pebble", standalone_mode=False)
     except typer.TyperException as error:  # of a wrong command line
         context, message = getattr(error, "ctx", None), error.format_message().rstrip(".")
-        if context is not None and message == "Missing command":
+        if context is not None and message == "Missing command":  # `pebble fleet` alone asks what there is
             typer.echo(context.get_help())
             return 0
         from pebble.config.secret_text import without_secrets  # of use to errors only
@@ -161,7 +161,7 @@ def _run(arguments: list[str]) -> int:
         return 2
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
-        if package in ("", "pebble"):
+        if package in ("", "pebble"):  # a mistake of ours, with its traceback
             raise
         install = 'pip install "pebble-robot[all]"'
         raise PebbleError(f"{arguments[0]} needs the package {package}, which is not installed: {install}") from None

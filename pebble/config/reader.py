@@ -129,10 +129,10 @@ class Reader:
             return self._scalar(annotation, raw, path, default)
         return self._replacement(annotation, raw, path, default)
 
-    def _scalar(self, annotation: Any, raw: Any, path: problems.Path, default: Any) -> Any:
+    def _scalar(self, annotation: Any, raw: Any, path: problems.Path, default: Any) -> Any:  # text, number or bool
         kind, metas = unwrap(annotation)
         choices = _choices(kind, metas)
-        if choices and isinstance(raw, str):
+        if choices and isinstance(raw, str):  # upper and lower case count as one
             raw = next((choice for choice in choices if str(choice).lower() == raw.lower()), raw)
         try:
             value = msgspec.convert(raw, annotation)
@@ -231,9 +231,9 @@ def expected(kind: Any, metas: list[Meta]) -> str:
 
 
 def _limits(metas: list[Meta]) -> Iterator[str]:
-    bound: dict[str, float] = {}
-    for meta in metas:
-        bound |= {name: limit for name in ("ge", "gt", "le") if (limit := getattr(meta, name)) is not None}
+    """Yield a number's limits in words, to follow "a number"."""
+    limits = [(name, getattr(meta, name)) for meta in metas for name in ("ge", "gt", "le")]
+    bound = {name: limit for name, limit in limits if limit is not None}  # of several ``metas`` the last counts
     if "ge" in bound and "le" in bound:
         yield f"from {bound['ge']} to {bound['le']}"
     elif "gt" in bound:

@@ -316,7 +316,7 @@ class Forwarder:
         """Return an admitted message as it may pass, or why not: it is too late, or a script elsewhere sent it."""
         if subject.kind.one_shot and self._is_late(subject, message, forward, account):
             return Drop.LATE
-        if not forward.unsigned:  # it may have a script's signature
+        if not forward.unsigned:  # here signed commands pass, too
             return message
         return self._without_script(source, message) or Drop.SIGNED
 
@@ -369,10 +369,10 @@ class Forwarder:
             case Finding.SUSPECT:  # the probe goes first: it comes back before the message does
                 self.publisher.probe(side, message.topic, message.payload)
                 return None
-            case Finding.RELAY:
+            case Finding.RELAY:  # another bridge's probe
                 relayed = Forward(forward.qos, False, forward.urgent)  # False: not retained
                 self.publisher.publish(self.sides[side.other], subject, message, relayed)
-        return Drop.PROBE  # of RELAY, too: that probe was sent on above
+        return Drop.PROBE  # Finding.PROBE: ours, or forwarded before; after RELAY: published just now
 
     def _hold_event(self, target: SideState, message: Message) -> Drop:
         if self.gate is Gate.SHUT:

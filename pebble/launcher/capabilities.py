@@ -74,7 +74,7 @@ def _system(config: Config, addresses: Addresses) -> offers.SystemOffer:
 def _motor(
     config: Config, addresses: Addresses, lacking: Collection[str]
 ) -> tuple[offers.DriveOffer, offers.EstopOffer, offers.LightsOffer, offers.TelemetryOffer]:
-    """Return the offers of the motor MCU's serial line: drive, stop, lights and telemetry, with their topics in use."""
+    """Return the offers of the motor MCU's line: drive, stop, lights and telemetry. ``lacking``: see `capabilities`."""
     lines, owned = config.motor_lines(), bool(config.motor_owners)
     present = bool(lines)
     name = next(iter(lines), "")  # the first of several lines; "": the section is the only line, or there is none

@@ -60,7 +60,7 @@ class MotorGuard:
         self._hold_until: float | None = None  # the end of the hold of the person who commanded last
         self._barred = 0  # the newest barred run, as saved and published last
         self._log = RateLimitedLog(log, burst=5)
-        self._can_save = False
+        self._can_save = False  # the file can be written, as far as :meth:`begin` and :meth:`save_again` know
 
     def begin(self, now: float) -> None:
         """Continue with the state in the file, and publish it."""

@@ -64,7 +64,7 @@ class RateController:
         self._steps, self._outgoing = steps(bundle, bitrate), outgoing
         self._levels = LevelControl(len(self._steps) - 1, now)
         self._in_flight = InFlight(_OVERHEAD, _LIMIT)
-        self._rests, self._is_resting = Rests(thin), False
+        self._rests, self._is_resting = Rests(thin), False  # pauses after slow packets; one lasts, by the last poll
         self._age_s = 0.0  # of the oldest packet in flight, beyond a round trip
 
     @property

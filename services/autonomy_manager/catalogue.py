@@ -265,7 +265,7 @@ class Catalogue:
 
 
 def files(scripts: Iterable[Script]) -> list[dict[str, object]]:
-    """Return the ``files`` of `autonomy-files`; from the first form on that would make it too long, without forms."""
+    """Return the ``files`` of `autonomy-files`. If a form would make it too long, it and all later ones are omitted."""
     entries: list[dict[str, object]] = []
     room = _LONGEST_FILES
     for script in scripts:

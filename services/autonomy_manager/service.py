@@ -66,8 +66,8 @@ class AutonomyManager(Service):
         self._offer = Offer(self.config, self.post, self._publish_files, scripts)
         self._overridden_until = float("-inf")  # until then a person drives, not the script that runs
         self._refused_until = float("-inf")  # until then the arbiter refuses scripts, so none is started
-        self._status: AutonomyStatus | None = None
-        self._connected_before = False
+        self._status: AutonomyStatus | None = None  # as published last
+        self._connected_before = False  # on_connected was called
         self._waiting: Callable[[], None] | None = None  # a start, until its script is listed
         self._signs = True  # the newest run's script signs its drive commands; else they look like a person's
         self._unsigned_moves = False  # while it does not sign: the newest command without a signature moves the wheels
@@ -162,7 +162,7 @@ class AutonomyManager(Service):
         if run is not None and (why := self._owners.ending(run.number, run.baseline, self._signs)):
             self._runner.stop(why, stopped=stopped)
         if self._runner.stopped and not stopped:  # its error is a stop, which was reset
-            self._runner.refuse(None)  # scripts may start again
+            self._runner.refuse(None)  # None: scripts may start again
 
     def _control(self, state: ControlState, owner: str) -> None:
         self._owners.receive_control(owner, state)

@@ -350,7 +350,7 @@ class MqttBridge(ForwardingService):
         if message.topic == self._control_topic:
             self._follow_control(message.payload)
         if message.topic == self._stop_topic and not message.retain:  # the owners have it unless one restarts now
-            self._passed_stops.accept(named(message.payload), nameless=not is_named(message.payload))
+            self._passed_stops.accept(named(message.payload), nameless=not is_named(message.payload))  # it gets a name
         self._leftovers.note_local(message)
         for admitted in self._private.admit(message):
             self._react(Side.LOCAL, admitted, self.forwarder.receive(Side.LOCAL, admitted))

@@ -130,7 +130,7 @@ class SoundboardHandler(Service):
         """Play the waiting request, if there is one."""
         self._playback = None
         if self._request is not None:
-            self._request.starts += 1
+            self._request.starts += 1  # until it was played ``times`` times, see _changed
             self._playback = Playback(self._request.clip, self.config, self.post_first, self._changed)
             self._playback.start()
         else:

@@ -106,7 +106,7 @@ class Dialler:
 
     def _probe(self, owner: Owner, counters: Counters, stopping: threading.Event) -> None:
         """Test whether the broker accepts us without bridge mode; leave our will out, as a failure would publish it."""
-        probe = self._make(None, owner, counters, as_published=False)
+        probe = self._make(None, owner, counters, as_published=False)  # None: no will; False: no bridge mode
         try:
             probe.connect(stopping)
             probe.disconnect()

@@ -110,8 +110,8 @@ def _config(settings: ZenohSettings, mode: str, listen: list[Path], connect: lis
         "mode": mode,
         "listen": {"endpoints": [*map(unix_endpoint, listen), *map(_numbered, settings.listen)]},
         "connect": {"endpoints": [*map(unix_endpoint, connect), *map(_numbered, settings.connect)], "retry": _RETRY},
-        # How long a router or peer waits for scouting before open() returns; 500 ms by default.
-        # Gossip would announce our unix sockets to programs connected by TLS: two connected robots of one machine had
+        # delay: how long a router or peer waits for scouting before open() returns, in ms; by default 500.
+        # gossip: it would announce our unix sockets to programs connected by TLS: two connected robots of a machine had
         # all their processes connect to each other, without TLS. Each process finds its siblings without it.
         "scouting": {"delay": 1, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "timestamping": {"enabled": False},  # the order of arrival at the hub decides, never a clock

@@ -236,7 +236,7 @@ def _of_bases(name: str, account: Account, *, at_hub: bool) -> Iterator[Rule]:
                 yield from _of_neighbour(base)
         elif ProgramRole.BOARDS in roles and at_hub:
             continue  # no rule, as the robots that it carries are at a broker
-        elif ProgramRole.BOARDS in roles or ProgramRole.ROBOT in roles:
+        elif ProgramRole.BOARDS in roles or ProgramRole.ROBOT in roles:  # BOARDS: at the broker of the operators
             yield from (Rule(access, f"{base}/#") for access in ("read", "write"))
             if ProgramRole.ROBOT in roles and not at_hub:
                 yield Rule("write", f"{c.SHORT}{name}")  # a short topic for groups of streams on a thin link

@@ -59,8 +59,8 @@ class Server:
         self._server: WebSocketServer | None = None
         self._channels: dict[str, foxglove.Channel] = {}  # by topic
         self._lock = threading.Lock()  # guards what follows
-        self._subscribers: dict[str, set[int]] = {}  # by topic: the ids of clients
-        self._remembered: dict[str, _Remembered] = {}  # by topic: for clients that subscribe later
+        self._subscribers: dict[str, set[int]] = {}  # by topic: ids of clients
+        self._remembered: dict[str, _Remembered] = {}  # by topic: the last message, for later subscribers
         self._remembered_bytes = 0
 
     def start(self, host: str, port: int) -> str:

@@ -195,7 +195,7 @@ class SoundDecoder:
 
     def __init__(self) -> None:
         self.counters = Counters()
-        self._format = (0, 0, 0)
+        self._format = (0, 0, 0)  # codec, rate and channels of the last packet
         self._opus: OpusDecoder | None = None
 
     def feed(self, payload: bytes) -> ReceivedSound | None:

@@ -174,7 +174,7 @@ class OpenComponents:
 
         A topic that has a meaning keeps it, unless it is that of a flag.
         """
-        filters: _Filters = {channel.filter(ref): None for channel in WATCHED}
+        filters: _Filters = {channel.filter(ref): None for channel in WATCHED}  # None: the names tell the meaning
         for channel in _NAMED:
             self._add(filters, ref, channel)
         for metric in self._robots.aliases(ref):

@@ -157,7 +157,7 @@ class HubWorker:
             self.apply(StoredWill(hello.name, hello.will))
             lacking = self._store.lacks(hello)
             if lacking:
-                self._waiting.forget(hello.name)  # the client sends these, and then another hello
+                self._waiting.forget(hello.name)  # not all is here: the client sends these, and then another hello
             elif not account:  # no subscriber waits for what other machines retain
                 self._waiting.count_from(hello.name, hello.retained_count)
             query.reply(wire.asked(wire.HELLO, account), wire.encode(lacking))

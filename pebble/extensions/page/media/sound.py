@@ -85,10 +85,10 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
 
     def __init__(self, broker: Broker, robots: Robots, ref: str, note: NoteTalk) -> None:
         super().__init__(broker, robots, ref, "audio", "web/sound", _AT_REST)
-        self._voice = Voice()
-        self._note_talk = note
-        self._talk: Talk | None = None
-        self._talker: SoundPage | None = None
+        self._voice = Voice()  # makes packets of a talk
+        self._note_talk = note  # for the audit
+        self._talk: Talk | None = None  # the present one
+        self._talker: SoundPage | None = None  # whose talk it is
 
     def leave(self, viewer: SoundPage) -> None:
         super().leave(viewer)

@@ -224,7 +224,8 @@ class PlayedRobot:
         position_ms = self.player.position_ns / 1e6
         rests = self.player.paused and not self._is_new  # after a seek even a paused player has something to show
         is_position_due = not rests and now - self._played_at >= _PLAYED_S
-        if is_position_due or rests != self._rested:  # the page knows another state than the present one
+        knows_state = rests == self._rested  # the page was told whether the player rests now
+        if is_position_due or not knows_state:
             self._rested = rests
             self._show()
         if not rests and now - self._liveness_at >= _LIVENESS_S and self._robot.live:

@@ -192,10 +192,13 @@ class _Program:
 
 
 def _connected(config: Config, path: Path) -> Transport:
-    """Return the open local transport. Raises PebbleError that names what is missing, for a script run in a shell."""
+    """Return the open local transport. Raises PebbleError that names what is missing, for a script run in a shell.
+
+    A script of the manager, which sets RUN, goes on without a connection: the transport makes one when it can.
+    """
     transport = local_transport(config, f"script-{os.getpid()}")
     transport.open(_CONNECT_S)
-    if transport.state is not State.CONNECTED and RUN not in os.environ:  # RUN: the manager of scripts sets it
+    if transport.state is not State.CONNECTED and RUN not in os.environ:
         why = transport.problem or f"no answer within {_CONNECT_S:g} s"
         transport.close()
         raise TransportError(f"{config.identity.id} is not up ({why}): start it with `pebble up {path}`")

@@ -158,8 +158,9 @@ class Renderer:
         area = (columns[1] - columns[0]) * (rows[:, 1] - rows[:, 0]).mean()
         whole_width = math.dist(surface.left, surface.right)
         area *= whole_width / max(1e-9, math.dist(plan[0], plan[1]))  # of the whole surface, also beside the picture
-        fine = [level for level, texture in enumerate(surface.textures) if len(texture) ** 2 >= area]
-        level = fine[-1] if fine else 0  # the smallest that is not enlarged
+        pixels = [len(texture) ** 2 for texture in surface.textures]  # falling
+        large_enough = [level for level, count in enumerate(pixels) if count >= area]
+        level = large_enough[-1] if large_enough else 0  # the smallest that is not enlarged
         size = len(surface.textures[level])
         (ahead1, right1), (ahead2, right2) = self._to_camera(np.array((surface.left, surface.right)), me)
         to_space = np.array(  # from pixels of the texture to (right, down, ahead) of the camera
