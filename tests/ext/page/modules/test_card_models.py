@@ -221,7 +221,7 @@ may = Script(
     {
         "ui/cards/autonomy-model.js": "whyNotStarted",
         "ui/parts/why-not.js": "whyNot, whyNotEnd",
-        "ui/parts/parts.js": "isGone",
+        "ui/parts/parts.js": "held, isGone",
     },
     _PAGE,
 )
@@ -262,6 +262,10 @@ MAY: Rows = {
     **{f"after {age} s of {period} s a value is gone: {gone}": (
         f"result = isGone({{ age: {1000 * age}, period: {1000 * period} }}, {json.dumps(online)});", gone)
         for age, period, online, gone in GONE},
+    "of the keys only Space and Enter hold a button, each once": ("""
+        let begun = 0; const { onKeyDown } = held(() => begun++, () => {}, true);
+        for (const code of ["KeyW", "Space", "Enter"]) [false, true].forEach((repeat) => onKeyDown({ code, repeat }));
+        result = begun;""", 2),
 }
 # fmt: on
 

@@ -232,14 +232,19 @@ REASONS: Rows = {
 # -- whose it is
 
 
-def test_a_stop_by_request_has_the_name_of_the_person() -> None:
+def test_a_stop_has_an_id_and_by_request_the_name_of_the_person_also_if_the_page_is_left() -> None:
     steps = """
       const asked = [];
-      globalThis.fetch = async (url) => (asked.push(url), { ok: true });
-      new Estop({ send: () => false, you: { user: "Ann & Bo" } }).press("pebble/robots/goob");
-      result = asked.map((url) => url.replace(ROOT, "/"));
+      globalThis.fetch = async (url, { keepalive }) => (asked.push(url.replace(ROOT, "/"), keepalive), { ok: true });
+      for (const isSent of [true, false]) {
+        const estop = new Estop({ send: () => isSent, you: { user: "Ann & Bo" } });
+        estop.press("pebble/robots/goob");
+        asked.push(estop.pressed.reached, /^[0-9a-f]{16}$/.test(estop.pressed.stop));
+      }
+      result = asked;
     """
-    assert evaluate({"core/estop.js": "Estop", "core/browser.js": "ROOT"}, steps) == ["/api/estop?name=Ann%20%26%20Bo"]
+    imports = {"core/estop.js": "Estop", "core/browser.js": "ROOT"}
+    assert evaluate(imports, steps) == [True, True, "/api/estop?name=Ann%20%26%20Bo", True, False, True]
 
 
 # -- actions: what is done is listed as [action, phase]
@@ -356,26 +361,40 @@ const lock = { released: false, release() { seen.push("off"); this.released = tr
 const request = async () => (seen.push("on"), Object.assign(lock, { released: false }));
 define("navigator", { wakeLock: { request } });
 define("setInterval", (run) => (later = run));
-const { install } = await import(given);
-const driver = { ref: "pebble/robots/goob", lease: {}, onChange() {} };
+define("fetch", async () => seen.push("reload"));
+const driver = { ref: "pebble/robots/goob", lease: {}, sliders: { speed: 0.5 }, changed() {}, onChange() {} };
 const panels = { toggle: (name) => seen.push(name) };
-const page = { driver, connection: { show() {} }, store: { get: () => undefined }, panels, commands: {} };
-install(page);
-page.sound = { toggleMute: () => seen.push("mute") };
+const connection = { isOpen: true, show() {}, socket: { send: () => false } };
+const page = { driver, connection, store: { get: () => undefined }, panels, commands: {} };
 const key = (code, key = code) => driver.actions.keyDown({ code, key, repeat: false });
 const turn = () => new Promise((resolve) => setImmediate(resolve));
 """
+_INSTALL = f"""
+const {{ install }} = await import("{(STATIC / "ui" / "more.js").as_uri()}");
+install(page);
+page.sound.model = {{ toggleMute: () => seen.push("mute") }};
+"""
 
 
-def test_behind_an_open_panel_there_is_only_the_help_and_the_screen_stays_on_while_this_page_has_control() -> None:
-    steps = """key("KeyM"); dialog = {}; key("KeyM"); key("Slash", "?"); await turn();
-    page.connection.isOpen = true; let you = false; page.store.get = () => ({ value: { you } });
-    for (you of [false, true, true, false, false, true]) { later(); await turn(); }
-    lock.released = true; later(); await turn(); result = seen;"""
-    module = (STATIC / "ui" / "more.js").as_uri()
-    assert evaluate({}, _MORE + steps, module) == ["mute", "help", "on", "off", "on", "on"]
+more = Script({}, _MORE + _INSTALL, "await turn();\nresult = seen;")
 
 
-@rows((gesture, GESTURE), (inputs, INPUTS), (reasons, REASONS), (actions, ACTIONS), (mapping, MAPPING))
+# fmt: off
+MORE: Rows = {
+    "behind an open panel there is only the help":
+        ('key("KeyM"); dialog = {}; key("KeyM"); key("Slash", "?");', ["mute", "help"]),
+    "the screen stays on while this page has control": ("""
+        let you = false; page.store.get = () => ({ value: { you } });
+        for (you of [false, true, true, false, false, true]) { later(); await turn(); }
+        lock.released = true; later();""", ["on", "off", "on", "on"]),
+    "keys change the speed": ('key("NumpadAdd", "+"); await turn(); seen.push(driver.sliders.speed);', [0.6]),
+    "a command that was not sent has no number": ("seen.push(page.commands.setLights(driver.ref, {}));", [0]),
+    "a page that a person uses is not loaded anew by itself": (
+        "connection.isOld = true; for (const now of [1e6, 2e6]) { performance.now = () => now; later(); }", []),
+}
+# fmt: on
+
+
+@rows((gesture, GESTURE), (inputs, INPUTS), (reasons, REASONS), (actions, ACTIONS), (mapping, MAPPING), (more, MORE))
 def test_each(found: Callable[[], Any], expected: Any) -> None:
     assert found() == expected

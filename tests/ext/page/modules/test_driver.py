@@ -285,6 +285,12 @@ SHOWN: Rows = {
     "a gamepad that stands still while it is deflected is given up and reported": ("""
         const frozen = real(1); show(real(0)); pass(2500, frozen); result = [driver.output.z];
         pass(1000, frozen); result.push(driver.output.z, driver.reason().code);""", [0.6, 0, "pad"]),
+    "who loses control learns to whom, and how long it was not used": ("""
+        const lost = [], of = (view) => { store.set(REF, "web/driver", view); show(); };
+        driver.lease.onLost = (...why) => lost.push(why); of({ you: true, by: "anna", idle_s: 3 });
+        socket.state = "lost"; of({ you: false, by: "bob" }); result = [lost.length];
+        socket.state = "open"; show(); store.drop(REF, "web/driver"); show();
+        result.push(lost, driver.failed.size);""", [0, [["bob", 3000]], 0]),
     "a gamepad in another window is reported and its stop counts": ("""
         document.hasFocus = () => false; show(real(0)); show(real(1)); result = [codes(), driver.output.z];
         show(real(1, 8, 9)); result.push(stops());""", [["focus"], 0, ["estop: gamepad"]]),

@@ -107,6 +107,14 @@ MICROPHONE: Rows = {
 # fmt: on
 
 
+#: What is different, and why no person can talk then.
+WHY_NO_TALK = {
+    "store.set(REF, 'capabilities', { value: {} })": "goob has no sound",
+    "connection.may = () => false": "Log in as driver to talk",
+    "navigator.mediaDevices = undefined": "Needs https",
+    "store.set(REF, 'link', { level: 'narrow' })": "The connection of goob is too slow for a voice",
+    "store.set(REF, 'web/sound', { talker: 'bob' })": "bob is talking",
+}
 # fmt: off
 SOUND: Rows = {
     "a talk uses the microphone which is muted until the next one": ("""
@@ -120,9 +128,12 @@ SOUND: Rows = {
     **{f"a microphone that is granted after the talk is given back: {end}": (
         f"await talk(true); {end}; await answer(); result = [open().length, told.includes('talk 1')];", [0, False])
         for end in ("await talk(false)", "sound.interrupt()", "go('')")},
-    **{f"what interrupts a gesture closes the microphone: {before}": (
-        f"await talk(true); await answer(); {before} sound.interrupt(); result = [open().length, sound.talking];",
-        [0, None]) for before in ("", "await talk(false);")},
+    **{f"what interrupts a gesture closes the microphone, and to let go then begins no talk: {before}": (
+        f"await talk(true); await answer(); {before} sound.interrupt(); await talk(false);"
+        "result = [open().length, sound.talking];", [0, None]) for before in ("", "await talk(false);")},
+    "nothing is heard while a person talks": ("""
+        await talk(true); result = [sound.speaker.gain.gain.value]; await talk(false);
+        result.push(sound.speaker.gain.gain.value);""", [0, 1]),
     "why a talk has failed is known until the next one or another component": ("""
         const denied = () => Object.assign(new Error("no"), { name: "NotAllowedError" });
         await talk(true); await answer(denied()); result = [sound.problem, sound.talking];
@@ -134,12 +145,9 @@ SOUND: Rows = {
     "a talk that cannot begin is no talk": (
         "broken = 'worker'; await talk(true); result = [sound.talking, sound.problem, questions.length];",
         [None, "Talking has failed: no worker", 0]),
-    "a key that cannot talk shows why": (
-        "connection.may = () => false; await talk(true); result = [shown, sound.talking];",
-        [["Not done: Log in as driver to talk"], None]),
-    "over a slow connection no microphone is asked for": (
-        "store.set(REF, 'link', { level: 'narrow' }); await talk(true); result = [shown, questions.length];",
-        [["Not done: The connection of goob is too slow for a voice"], 0]),
+    **{f"a key that cannot talk shows why and asks for no microphone: {why}": (
+        f"{change}; await talk(true); result = [shown, sound.talking, questions.length];",
+        [[f"Not done: {why}"], None, 0]) for change, why in WHY_NO_TALK.items()},
     "a talk that a slow connection ends has its reason beside the button": ("""
         await talk(true); await answer(); store.set(REF, "link", { level: "thin" });
         sound.take({ answer: { talk: 1, on: false, why: sound.talkReason() } });
@@ -204,8 +212,10 @@ def test_the_lead_at_the_loudspeaker_grows_when_the_worker_is_late_and_shrinks_a
       run(0.1, false);
       run(1);
     }
-    result.push(run(0), run(60));"""
-    assert evaluate({"media/playout.js": "Playout"}, steps) == [20, 40, 20]
+    result.push(run(0), run(60));
+    now += 5000;  // the loudspeaker has stopped, and so does its clock
+    result.push(Math.round(1000 * (playout.now() - playout.played / RATE)));"""
+    assert evaluate({"media/playout.js": "Playout"}, steps) == [20, 40, 20, 100]
 
 
 # -- buffer and resampler do exactly what those of pebble.extensions.media do, on the same packets
