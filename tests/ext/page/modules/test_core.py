@@ -11,11 +11,11 @@ import pytest
 from pebble.extensions.operator.client.drive_reasons import WORDS
 from tests.ext.page.in_node import STATIC, Rows, Script, evaluate, rows
 
-# -- gestures: what is sent is listed as [gesture, z, final]
+# -- gestures: what is sent is listed as [gesture, sum of the axes, final]; all but z are 0
 
 _GESTURE = """
 const sent = [];
-const gesture = new Gesture(({ g, z, final }) => sent.push([g, z, final]));
+const gesture = new Gesture(({ g, x, z, y, final }) => sent.push([g, x + z + y, final]));
 let now = 1000;
 const at = (z) => ({ x: 0, z, y: 0 });
 const step = (z, { wait = 50, allowed = true, neutral, waits } = {}) =>
@@ -234,17 +234,24 @@ REASONS: Rows = {
 
 def test_a_stop_has_an_id_and_by_request_the_name_of_the_person_also_if_the_page_is_left() -> None:
     steps = """
-      const asked = [];
-      globalThis.fetch = async (url, { keepalive }) => (asked.push(url.replace(ROOT, "/"), keepalive), { ok: true });
-      for (const isSent of [true, false]) {
+      const asked = [], reached = [];
+      const answers = [() => ({ ok: true }), () => ({ ok: false }), () => { throw new Error("no connection"); }];
+      globalThis.fetch = async (...request) => (asked.push(request), answers.shift()());
+      for (const isSent of [true, false, false, false]) {
         const estop = new Estop({ send: () => isSent, you: { user: "Ann & Bo" } });
         estop.press("pebble/robots/goob");
-        asked.push(estop.pressed.reached, /^[0-9a-f]{16}$/.test(estop.pressed.stop));
+        reached.push([/^[0-9a-f]{16}$/.test(estop.pressed.stop), estop.pressed.reached]);
+        await new Promise((resolve) => setImmediate(resolve));
+        reached.at(-1).push(estop.pressed.reached);
       }
-      result = asked;
+      const [[url, { keepalive }]] = asked;
+      result = [url.replace(ROOT, "/"), keepalive, reached];
     """
-    imports = {"core/estop.js": "Estop", "core/browser.js": "ROOT"}
-    assert evaluate(imports, steps) == [True, True, "/api/estop?name=Ann%20%26%20Bo", True, False, True]
+    assert evaluate({"core/estop.js": "Estop", "core/browser.js": "ROOT"}, steps) == [
+        "/api/estop?name=Ann%20%26%20Bo",
+        True,
+        [[True, True, True], [True, False, True], [True, False, False], [True, False, False]],
+    ]
 
 
 # -- actions: what is done is listed as [action, phase]
@@ -318,6 +325,26 @@ ACTIONS: Rows = {
 # fmt: on
 
 
+# -- what browsers lack, deny or take away
+
+denying = Script({"core/browser.js": "fullScreen, local", "core/browser-more.js": "isLoopback, microphone"})
+HERE = ["127.0.0.1", "0.0.0.0", "[::1]", "[::]", "localhost", "robots.localhost"]
+# fmt: off
+DENYING: Rows = {
+    "what it does not keep is remembered until the page is left": ("""
+        const kept = new Map(), setItem = (key, text) => text.length < 9 && kept.set(key, text);
+        globalThis.localStorage = { setItem, getItem: (key) => kept.get(key) ?? null };
+        result = ["short", "very long", "anew"].map((text) => [local.set("a", text), local.get("a")]);""",
+        [[True, "short"], [False, "very long"], [True, "anew"]]),
+    "what it denies is not offered": (
+        "result = [fullScreen.possible, fullScreen.on, microphone.possible];", [False] * 3),
+    "no other machine reaches some addresses": (
+        f"result = {[*HERE, '192.168.1.7', '127.0.0.1.nip.io', '[fd00::1]']}.map(isLoopback);",
+        [True] * len(HERE) + [False] * 3),
+}
+# fmt: on
+
+
 # -- mappings of gamepads
 
 _MAPPING = """
@@ -387,7 +414,11 @@ MORE: Rows = {
         let you = false; page.store.get = () => ({ value: { you } });
         for (you of [false, true, true, false, false, true]) { later(); await turn(); }
         lock.released = true; later();""", ["on", "off", "on", "on"]),
-    "keys change the speed": ('key("NumpadAdd", "+"); await turn(); seen.push(driver.sliders.speed);', [0.6]),
+    "keys change the speed": ("""
+        for (const [code, times] of [["NumpadAdd", 1], ["NumpadAdd", 9], ["Minus", 1], ["Minus", 9]]) {
+          for (let n = 0; n < times; n++) key(code, code === "Minus" ? "-" : "+");
+          await turn(); seen.push(driver.sliders.speed);
+        }""", [0.6, 1, 0.9, 0.05]),
     "a command that was not sent has no number": ("seen.push(page.commands.setLights(driver.ref, {}));", [0]),
     "a page that a person uses is not loaded anew by itself": (
         "connection.isOld = true; for (const now of [1e6, 2e6]) { performance.now = () => now; later(); }", []),
@@ -395,6 +426,9 @@ MORE: Rows = {
 # fmt: on
 
 
-@rows((gesture, GESTURE), (inputs, INPUTS), (reasons, REASONS), (actions, ACTIONS), (mapping, MAPPING), (more, MORE))
+@rows(
+    (gesture, GESTURE), (inputs, INPUTS), (reasons, REASONS), (actions, ACTIONS), (denying, DENYING),
+    (mapping, MAPPING), (more, MORE),
+)  # fmt: skip
 def test_each(found: Callable[[], Any], expected: Any) -> None:
     assert found() == expected

@@ -18,7 +18,7 @@ from tests.support import ROOT, some
 
 LOOKS = "ui/parts/looks.js"
 looks = Script(
-    {LOOKS: "charge, looksOf"},
+    {LOOKS: "charge, hasFace, looksOf", "ui/parts/more-words.js": "charging, plain"},
     "const look = (id, payload) => looksOf(`pebble/robots/${id}`, payload);"
     "const brief = (one) => [one.name, one.picture, typeof one.colour, one.cells];"
     "const percent = (value, unit, cells) => charge({ value, unit }, cells);",
@@ -46,11 +46,19 @@ FACES: Rows = {
     "what is no look is not used": (
         f"result = brief(look('constructor', {stated(colour='url(x)', picture='__proto__', battery_cells=-1)}));",
         ["constructor", "wheeled", "string", 0]),
-    "a long name is cut": (f"result = look('r7', {stated(name='x' * 40)}).name;", "x" * 32 + " (r7)"),
+    "what is long is cut": (
+        f"const one = look('r7', {stated(name='x' * 40, description='y' * 99)}); result = [one.name, one.description];",
+        ["x" * 32 + " (r7)", "y" * 60]),
+    "robots have faces": ("result = ['robots', 'towers'].map((type) => hasFace(`pebble/${type}/a`));", [True, False]),
     "a name steers nothing": (f"result = look('r7', {stated(name=chr(0x202E) + 'x')}).name;", "\\u202ex (r7)"),
     "a battery is in percent where its cells are known": (
         "result = [[8.4, 2], [6, 2], [7.64, 2], [9, 2], [8, 0]].map(([value, cells]) => percent(value, 'V', cells));",
         [100, 0, 50, 100, None]),
+    "whether it charges is known or not": (
+        "result = [true, false, 'x'].map((value) => charging({ value }));", ["charging", "not charging", ""]),
+    "any value of it is one line": ("""
+        result = [1234.5678, 123_456.7, null, undefined, true, [1, { a: 2 }], { a: { b: "x" }, c: [] }].map(plain);""",
+        ["1234.6", "123457", "–", "–", "true", "[1, a 2]", "a {b x} · c []"]),
     "or where it says percent": (
         "result = [percent(81, '%', 0), percent('x', 'V', 2), charge(undefined, 2)];", [81, None, None]),
 }
@@ -91,6 +99,9 @@ COLUMNS: Rows = {
     "one column has them one after another": (
         f"result = at(1, [{STATE}, {MAP}, {PLOTS}, END], false);",
         {"state": [0, 0, 1], "map": [68, 0, 1], "plots": [176, 0, 1]}),
+    "what is wide leaves the last column to driving": (
+        f"result = at(3, [STAGE, DRIVE, {STATE}, {PLOTS}, END], true, {{ state: [[0, 1]] }});",
+        {"state": [164, 0, 1], "plots": [164, 1, 1]}),
     "a card keeps its column, and what is below it moves": (
         f"result = at(2, [STAGE, DRIVE, {STATE.replace('68', '200')}, {MAP}, END], true,"
         "{ state: [[0, 1]], map: [[0, 1]] });", {"state": [164, 0, 1], "map": [364, 0, 1]}),

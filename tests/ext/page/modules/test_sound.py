@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import random
 from collections.abc import Callable
 from typing import Any
@@ -9,13 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pebble.errors import PayloadError
+from pebble.extensions.media import opus
 from pebble.extensions.media.jitter import JitterBuffer
 from pebble.extensions.media.packets import Codec, Sound
 from pebble.extensions.media.pcm import Resampler
-from pebble.extensions.media.speech import Speech
+from pebble.extensions.media.sound import unpack
 from tests.ext.media.test_jitter import play
 from tests.ext.page.in_node import STATIC, Rows, Script, evaluate, rows
 from tests.support import cases
+from tests.vectors import make_pbat
 
 # -- the microphone and talks: a question of the browser is answered by ``answer()`` or ``answer(error)``
 
@@ -68,11 +72,12 @@ define("Worker", class {
 _SOUND = """
 const REF = "pebble/robots/goob";
 const changes = [];
-const route = { ref: REF, onChange: (fn) => changes.push(fn) };
+const onChange = (fn) => changes.push(fn);
+const route = { ref: REF, onChange };
 const go = (ref) => { route.ref = ref; changes.forEach((fn) => fn()); };
 const shown = [];
 const connection = {
-  isOpen: true, may: () => true, you: { user: "anna" }, show: (text) => shown.push(text), onChange() {},
+  isOpen: true, may: () => true, you: { user: "anna" }, show: (text) => shown.push(text), onChange,
 };
 const store = new Store(undefined, (flush) => flush());
 store.set(REF, "capabilities", { value: { audio: { available: true } } });
@@ -131,6 +136,9 @@ SOUND: Rows = {
     **{f"what interrupts a gesture closes the microphone, and to let go then begins no talk: {before}": (
         f"await talk(true); await answer(); {before} sound.interrupt(); await talk(false);"
         "result = [open().length, sound.talking];", [0, None]) for before in ("", "await talk(false);")},
+    "a talk ends where another person uses the page": ("""
+        await talk(true); await answer(); go(REF); result = [heard()];
+        connection.you = { user: "bob" }; go(REF); result.push(heard(), told.length);""", [1, 0, 3]),
     "nothing is heard while a person talks": ("""
         await talk(true); result = [sound.speaker.gain.gain.value]; await talk(false);
         result.push(sound.speaker.gain.gain.value);""", [0, 1]),
@@ -165,7 +173,9 @@ def test_the_socket_has_the_name_of_the_person_and_a_page_that_stood_still_learn
     const said = [], urls = [];
     define("self", { postMessage: (message) => said.push(message) });
     define("location", { origin: "http://127.0.0.1" });
-    define("WebSocket", class { static OPEN = 1; constructor(url) { urls.push(url); } });
+    let socket;
+    define("WebSocket", class { static OPEN = 1; readyState = 1; sent = []; bufferedAmount = 0;
+      constructor(url) { urls.push(url); socket = this; } send(piece) { this.sent.push(piece); } });
     let now = 0;
     performance.now = () => now;
     await import(given);
@@ -173,11 +183,12 @@ def test_the_socket_has_the_name_of_the_person_and_a_page_that_stood_still_learn
     const port = { close() {} };
     self.onmessage({ data: { op: "talk", talk: 3, rate: 16_000, port } });
     const feed = () => port.onmessage({ data: new Float32Array(1024) });
-    feed(); now = 900; feed(); result = [said.length]; now = 1100; feed();
+    feed(); now = 900; feed(); result = [said.length]; const { length } = socket.sent;
+    socket.bufferedAmount = 10_000; feed(); result.push(length, socket.sent.length); now = 1100; feed();
     result.push(said, Object.fromEntries(new URL(urls[0]).searchParams));"""
     worker = (STATIC / "media" / "sound-worker.js").as_uri()
     assert evaluate({}, steps, worker) == [
-        0, [{"answer": {"talk": 3, "on": False, "why": "The page stood still: talk again"}}],
+        0, 6, 6, [{"answer": {"talk": 3, "on": False, "why": "The page stood still: talk again"}}],
         {"ref": "a/b/c", "can": "", "name": "Ann & Bo", "device": "phone"},
     ]  # fmt: skip
 
@@ -218,7 +229,39 @@ def test_the_lead_at_the_loudspeaker_grows_when_the_worker_is_late_and_shrinks_a
     assert evaluate({"media/playout.js": "Playout"}, steps) == [20, 40, 20, 100]
 
 
-# -- buffer and resampler do exactly what those of pebble.extensions.media do, on the same packets
+# -- packets, buffer and resampler do exactly what those of pebble.extensions.media do, on the same packets
+
+_UNPACK = """
+result = given.map((hex) => {
+  try {
+    const { rate, channels, frames, sequence } = unpack(new Uint8Array(Buffer.from(hex, "hex")));
+    return [rate, channels, frames, sequence];
+  } catch { return null; }
+});
+"""
+
+
+def unpacked(raw: bytes) -> list[int] | None:
+    """What pebble.extensions.media.sound finds in a packet; None: it cannot be played."""
+    try:
+        one = unpack(raw)
+    except PayloadError:
+        return None
+    return [one.rate, one.channels, one.samples, one.sequence]
+
+
+def test_the_same_packets_can_be_played() -> None:
+    """Packets of every kind, and short ones with any byte of their beginning changed."""
+    bodies = [[bytes([first, 2, 0])] * count for first in range(256) for count in (1, 3, 4)]
+    lasting = [(opus.join(body), 48 * sum(map(opus.milliseconds, body))) for body in bodies]
+    packets = [Sound(Codec.OPUS, 1, 48000, int(samples), 1, 1, body).pack() for body, samples in lasting]
+    packets += [Sound(Codec.OPUS, 2, 16000, 320, 7, 1, b"\1\1" + bytes([8] * 257)).pack()]
+    packets += [bytes.fromhex(one["hex"]) for one in json.loads(make_pbat.FILE.read_text())]
+    for packet in [packet for packet in packets[::100] + packets[-28:] if len(packet) < 50]:
+        packets += [packet[:at] + bytes([to]) + packet[at + 1 :] for at in range(30) for to in (0, 1, 2, 3, 9, 255)]
+    found = evaluate({"media/sound-packet.js": "unpack"}, _UNPACK, [packet.hex() for packet in packets])
+    assert found == list(map(unpacked, packets))
+
 
 EPOCH_MS = 1_700_000_000_000
 Arrival = tuple[float, bytes]
@@ -312,10 +355,10 @@ def test_the_jitter_buffer_plays_the_same_samples_at_the_same_times(seeds: range
     assert evaluate(modules, _PLAY, given) == expected
 
 
-@pytest.mark.parametrize(("rate", "rate_out"), [(16000, 44100), (48000, 16000)])
+@pytest.mark.parametrize(("rate", "rate_out"), [(16000, 44100), (48000, 16000), (11025, 48000)])
 def test_the_resampler_makes_the_same_samples(rate: int, rate_out: int) -> None:
-    speech = Speech(rate).samples(0, rate // 2)
-    pieces = np.array_split(speech, 23)
+    sound = np.random.default_rng(7).integers(-8192, 8192, (rate // 2, 1))
+    pieces = np.array_split(sound, 23)
     resampler = Resampler(rate, rate_out, 1)
     expected = np.concatenate([resampler.feed(piece) for piece in pieces])[:, 0]
     steps = f"""
