@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import random
 from collections.abc import Callable
@@ -256,8 +257,11 @@ def test_the_same_packets_can_be_played() -> None:
     lasting = [(opus.join(body), 48 * sum(map(opus.milliseconds, body))) for body in bodies]
     packets = [Sound(Codec.OPUS, 1, 48000, int(samples), 1, 1, body).pack() for body, samples in lasting]
     packets += [Sound(Codec.OPUS, 2, 16000, 320, 7, 1, b"\1\1" + bytes([8] * 257)).pack()]
-    packets += [bytes.fromhex(one["hex"]) for one in json.loads(make_pbat.FILE.read_text())]
-    for packet in [packet for packet in packets[::100] + packets[-28:] if len(packet) < 50]:
+    for channels, rate, samples in itertools.product((8, 9), (3999, 4000), (1, 4000, 4001)):
+        packets += [Sound(Codec.PCM16LE, channels, rate, samples, 1, 1, bytes(2 * channels * samples)).pack()]
+    vectors = [bytes.fromhex(one["hex"]) for one in json.loads(make_pbat.FILE.read_text())]
+    packets += vectors
+    for packet in [packet for packet in packets[::100] + vectors if len(packet) < 50]:
         packets += [packet[:at] + bytes([to]) + packet[at + 1 :] for at in range(30) for to in (0, 1, 2, 3, 9, 255)]
     found = evaluate({"media/sound-packet.js": "unpack"}, _UNPACK, [packet.hex() for packet in packets])
     assert found == list(map(unpacked, packets))
