@@ -52,10 +52,10 @@ def without_secrets(text: str) -> str:
     """
     if _AT.search(text):
         text = re.sub(r"\S+", _without_login, _LOGIN_WITH_BLANKS.sub(rf"\1{HIDDEN}@", text))
-    text = _PAIR.sub(rf"\1{HIDDEN}", text) if "=" in text else text
-    text = _OPTION.sub(rf"\1{HIDDEN}", text) if "-" in text else text
-    hidden = rf"\1\2\3\4{HIDDEN}"  # of the four groups one is not empty
-    return _MEMBER.sub(hidden, _HEADER.sub(rf"\1{HIDDEN}", text)) if ":" in text else text
+    text = _PAIR.sub(rf"\1{HIDDEN}", text) if "=" in text else text  # without "=" it finds none: this saves time
+    text = _OPTION.sub(rf"\1{HIDDEN}", text) if "-" in text else text  # the same
+    text = _HEADER.sub(rf"\1{HIDDEN}", text) if ":" in text else text
+    return _MEMBER.sub(rf"\1\2\3\4{HIDDEN}", text) if ":" in text else text  # one of the four groups is not empty
 
 
 def _without_login(match: re.Match[str]) -> str:
@@ -68,9 +68,9 @@ def _without_login(match: re.Match[str]) -> str:
     slashes = _SLASHES.search(word)
     # The first colon with a password after it; the user name before it begins after a sign such as a quote.
     colon = next((colon for colon in _COLON.finditer(word, 0, end) if colon.end() < end), None)
-    if slashes and slashes.end() <= end:
+    if slashes and slashes.end() <= end:  # SCHEME://LOGIN@
         start = slashes.end()
-    elif colon:
+    elif colon:  # NAME:PASSWORD@
         start = max((sign.end() for sign in _BEFORE_USER.finditer(word, 0, colon.start())), default=0)
     else:
         return word

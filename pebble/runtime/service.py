@@ -158,7 +158,7 @@ class Service:
             self._send(channel, topic, raw)
 
     def listen(self, channel: Channel, method: Callable[..., None], *, direct: bool = False) -> Subscription:
-        """Handle ``channel`` until the returned subscription is closed; ``@on`` does the same for the whole run."""
+        """Handle ``channel`` until the subscription is closed, as ``@on`` does for the whole run, also ``direct``."""
 
         def deliver_direct(message: Message, value: Any, names: dict[str, str]) -> None:
             method(value, self.clock() - message.waited_s, **names)

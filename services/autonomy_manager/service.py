@@ -65,8 +65,8 @@ class AutonomyManager(Service):
         self._offer = Offer(self.config, self.post, self._publish_files, scripts)
         self._overridden_until = float("-inf")  # until then a person drives, not the script that runs
         self._refused_until = float("-inf")  # until then the arbiter refuses scripts, so none is started
-        self._status: AutonomyStatus | None = None
-        self._connected_before = False
+        self._status: AutonomyStatus | None = None  # as published last
+        self._connected_before = False  # on_connected was called
         self._waiting: Callable[[], None] | None = None  # a start, until its script is listed
         self._signs = True  # the newest run's script signs its drive commands; else they look like a person's
         self._unsigned_moves = False  # while it does not sign: the newest command without a signature moves the wheels
@@ -86,7 +86,7 @@ class AutonomyManager(Service):
         if not self._connected_before:
             self._connected_before = True
             self.listen(CONTROL_STATE, self._control)
-            try:  # a predecessor may have been killed with its script: a zero of a newer run bars that
+            try:  # a killed predecessor's script may still drive: the zero of a newer run bars its run
                 self.halt(next_run(self.config, self._owners.barred))
             except PebbleError as error:
                 self.log.error("%s", error)
@@ -103,8 +103,8 @@ class AutonomyManager(Service):
             self.log_limited.warning("command", "ignored a command that neither starts nor stops a script")
         elif begin:
             by = command.by if isinstance(command.by, str) else None
-            start = partial(self._start_script, (command.file or "").strip(), command.config or {}, by)
-            start(self.clock() + _LISTED_S)  # until then it may wait for the list of scripts
+            until = self.clock() + _LISTED_S  # until then the start may wait for the list of scripts
+            self._start_script((command.file or "").strip(), command.config or {}, by, until)
         else:
             self._runner.stop()
 
@@ -164,7 +164,7 @@ class AutonomyManager(Service):
         if run is not None and (why := self._owners.ending(run.number, run.baseline, self._signs)):
             self._runner.stop(why, stopped=stopped)
         if self._runner.stopped and not stopped:  # its error is a stop, which was reset
-            self._runner.refuse(None)  # scripts may start again
+            self._runner.refuse(None)  # None: scripts may start again
 
     def _control(self, state: ControlState, owner: str) -> None:
         self._owners.receive_control(owner, state)
@@ -237,7 +237,7 @@ class AutonomyManager(Service):
             self._local.release()
             raise
         self._signs, self._unsigned_moves = plan.main.script.ours, False
-        for number in self._owners.steps_to(run):  # zeros on the way, or an owner may take this run for an older one
+        for number in self._owners.steps_to(run):  # zeros of numbers in between: else an owner may think it older
             self.halt(number)
         return run, self._owners.baseline()
 

@@ -126,7 +126,7 @@ class PassedStops:
             first = self._passed.setdefault(name, now)
             if len(self._passed) > NAMES:
                 del self._passed[next(iter(self._passed))]
-            waiting = {key for key, pending in self.pending.items() if pending.stop.stop == name}  # these may lack it
+            waiting = {key for key, pending in self.pending.items() if pending.stop.stop == name}  # not confirmed yet
             reset_since = {key for key, owner in self._owners.items() if owner.freed_at > first} - waiting
             if reset_since:  # this repeats a stop that a reset has ended there: only the other owners get a copy
                 return [_encoded(stop, owner=key) for key in self._owners if key not in reset_since]

@@ -78,7 +78,7 @@ class Ros1Bridge(Ros1Reader, MotorOwner):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         ros = self.section.ros
-        self._lock_file = StateFile(self.config.state_file(f"lock-{self.owner}"))
+        self._lock_file = StateFile(self.config.state_file(f"lock-{self.owner}"))  # whether it has locked the base
         self._reported = Reported(self.notifier.mcu)
         self._shown: object = None  # the report of the base that was logged last
         self.cmd_vel = CmdVel(
@@ -87,7 +87,7 @@ class Ros1Bridge(Ros1Reader, MotorOwner):
             ros.cmd_vel_publish_interval_seconds,
             None if ros.estop_topic == NONE else ros.estop_topic,
             None if ros.cancel_topic == NONE else ros.cancel_topic,
-            owed=self._lock_file.load() not in (None, False),  # to unlock it: an unreadable file counts as a lock
+            owed=self._lock_file.load() not in (None, False),  # see CmdVel; an unreadable file counts as a lock
             save=self._lock_file.save,
         )
 

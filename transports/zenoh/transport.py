@@ -122,7 +122,7 @@ class ZenohTransport(Transport):
         self._barrier = Barrier(session, name, lambda: self._hub.retained_count, by_name=self._elsewhere)
         with self._connecting:
             for subscription in self._subscriptions:
-                self._start(session, subscription)
+                self._make_subscriber(session, subscription)
         watch.follow(session)
         return True
 
@@ -179,10 +179,10 @@ class ZenohTransport(Transport):
         counts, `HubConnection.fetch` lets the hub answer only after these. Siblings on other machines (`_elsewhere`)
         are in no run directory here, so only the hub is waited for.
         """
-        if self._barrier is None:
+        if self._barrier is None:  # no session has begun
             return {}
 
-        def expected() -> dict[str, str]:
+        def expected() -> dict[str, str]:  # by name: what each is, for logs
             siblings = {} if self._elsewhere else self._siblings.ready(but=self._hub.name)
             return siblings | dict.fromkeys(self._hub.watch.hubs, "the hub")
 
@@ -233,7 +233,7 @@ class ZenohTransport(Transport):
             lacking = self._hub.greet(session, hello, remaining_s)
             if lacking is None:
                 return False
-            if not self._send_lacking(session, lacking - sent):  # the hub has all, or no room for what was sent before
+            if not self._send_lacking(session, lacking - sent):  # nothing left: the hub has all, or no room for `sent`
                 return True
             sent |= lacking
         return False
@@ -246,7 +246,7 @@ class ZenohTransport(Transport):
         with self._publishing:
             owed = bool(self._own.pending or lacking)
             self._sync_retained(self._own.keys() - lacking)  # sends all but these
-            self._hub.put_removals(session, lacking)  # or it may lack their removals
+            self._hub.put_removals(session, lacking)  # what the hub lacks may also be the removal of a message
             return owed
 
     def _refresh(self) -> None:
@@ -257,7 +257,7 @@ class ZenohTransport(Transport):
             with self._hub.lock:
                 self._hub.renew()  # answers to earlier queries are dropped
                 self._renew()  # all subscriptions: retained messages are delivered again
-            counts = self._synchronize(SYNC_S)  # after _renew: messages received live meanwhile are newer
+            counts = self._synchronize(SYNC_S)  # after _renew: a retained one is dropped if a live one comes first
             self._hub.fetch(self.session, list(self._subscribers), counts)
 
     # -- sending
@@ -295,7 +295,7 @@ class ZenohTransport(Transport):
                 return  # they are declared when there is a session
             with contextlib.suppress(zenoh.ZError):  # closed meanwhile: then nothing is received any more
                 for subscription in subscriptions:
-                    self._start(session, subscription)
+                    self._make_subscriber(session, subscription)
                 counts = self._synchronize(SYNC_S)
                 if self._state is State.CONNECTED:
                     self._hub.fetch(session, subscriptions, counts)
@@ -306,7 +306,7 @@ class ZenohTransport(Transport):
             with contextlib.suppress(zenoh.ZError):  # closed meanwhile
                 subscriber.undeclare()  # type: ignore[no-untyped-call]
 
-    def _start(self, session: zenoh.Session, subscription: Subscription) -> None:
+    def _make_subscriber(self, session: zenoh.Session, subscription: Subscription) -> None:
         if subscription in self._subscribers:
             return
         origin = zenoh.Locality.ANY if subscription.echo else zenoh.Locality.REMOTE
@@ -318,7 +318,7 @@ class ZenohTransport(Transport):
             self.count_received()
             read_at = clock.since_boot()
             stamp = wire.read_live(sample.attachment)
-            # A sender of the same boot shares our clock: its age counts from the sending. Most need no second look.
+            # A sender of this boot shares our clock: the age is known. Only if it is high, or unknown, ask `_is_late`.
             since = stamp.sent_ns / 1e9 if stamp.boot == wire.BOOT else None
             if (since is None or read_at - since > late_s) and self._is_late(sample, stamp, read_at):
                 return

@@ -338,7 +338,7 @@ class DescribedBridge(SerialService):
         if uid is None:  # the filter's + also matches an empty level
             self.counters.add("refused")
             return
-        manifest = None
+        manifest = None  # of an empty message: the manifest was removed
         if message.payload:
             try:
                 manifest = codec.decode(MCU_DESCRIBE, message.payload)
@@ -349,6 +349,7 @@ class DescribedBridge(SerialService):
         self.post_message(MCU_DESCRIBE, partial(self._receive_manifest, uid, manifest, message.retain))
 
     def _receive_manifest(self, uid: str, manifest: McuManifest | None, retained: bool) -> None:
+        """Follow the manifests of other devices, whose claims decide about our aliases; restore our own if removed."""
         if self.device is not None and uid == self.device.uid:
             if manifest is None:
                 self.republish()  # another process removed it, for example that of a device with the same uid
@@ -357,7 +358,7 @@ class DescribedBridge(SerialService):
             self._peers.forget(uid)
         else:
             self._peers.add(uid, frozenset(claims(manifest).granted), self.clock(), retained=retained)
-            if retained:  # ask the device's bridge for the manifest: one that does not come in time, _tick removes
+            if retained:  # let the device's bridge publish it again: if none does so in time, _tick clears it
                 self.publish(MCU_COMMAND, {}, uid=uid, name=RESERVED)
         self.aliases.update()
         self._arm()

@@ -214,7 +214,7 @@ def subscribed_stop(transport: Transport, base: str) -> RobotEstop:
     robot = RobotEstop(base)
     robot.subscribe(transport)
     wait_for(lambda: robot.has_capabilities, _LATE_S)
-    transport.ask(robot.missing)
+    transport.ask(robot.missing)  # again, for the owners that late capabilities have listed
     wait_for(lambda: not robot.missing, _LATE_S)
     return robot
 
