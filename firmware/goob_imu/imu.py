@@ -131,7 +131,7 @@ class Imu:
         if not ax and not across:
             return  # free fall: no direction of gravity
         roll, pitch = atan2(ay, az) * _CENTI_DEG, atan2(-ax, across) * _CENTI_DEG
-        if ms < _GAP_MS:
+        if ms < _GAP_MS:  # a complementary filter: the last attitude and its turn, corrected a little by gravity
             turned = self._roll + values[3] * ms / 1000
             roll = turned + _around(roll - turned) * _GRAVITY
             turned = self._pitch + values[4] * ms / 1000

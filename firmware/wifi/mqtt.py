@@ -96,7 +96,8 @@ class Client:
     def _publication(self, first: int, at: int, stop: int) -> None:
         """Acknowledge a publication, even one too long to be stored: else the broker holds back the next ones."""
         data = self.data
-        # where the topic ends, and where the payload begins; ``_end`` is the end of what was received
+        # ``topic`` is where the topic ends: beyond ``stop``, and so refused below, if not even its length is there.
+        # ``body`` is where the payload begins, ``_end`` the end of what was received.
         topic = at + 2 + (data[at] << 8 | data[at + 1]) if stop - at > 1 else stop + 1
         body = topic + (first & 6)  # QoS 1 sets the bit of 2, and puts a packet id of 2 bytes before it
         if first & 4 or body > stop or body > self._end:  # QoS above 1, or cut off
