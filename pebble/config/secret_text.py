@@ -52,10 +52,10 @@ def without_secrets(text: str) -> str:
     """
     if _AT.search(text):
         text = re.sub(r"\S+", _without_login, _LOGIN_WITH_BLANKS.sub(rf"\1{HIDDEN}@", text))
-    text = _PAIR.sub(rf"\1{HIDDEN}", text) if "=" in text else text  # without "=" it finds none: this saves time
-    text = _OPTION.sub(rf"\1{HIDDEN}", text) if "-" in text else text  # the same
+    text = _PAIR.sub(rf"\1{HIDDEN}", text) if "=" in text else text  # only if it can match: to save time
+    text = _OPTION.sub(rf"\1{HIDDEN}", text) if "-" in text else text
     text = _HEADER.sub(rf"\1{HIDDEN}", text) if ":" in text else text
-    return _MEMBER.sub(rf"\1\2\3\4{HIDDEN}", text) if ":" in text else text  # one of the four groups is not empty
+    return _MEMBER.sub(rf"\1\2\3\4{HIDDEN}", text) if ":" in text else text  # a match has one of the groups
 
 
 def _without_login(match: re.Match[str]) -> str:

@@ -64,7 +64,7 @@ def _member(metric: str, command: Any, by: Any) -> Member:
 
 def _strict_json(text: bytes) -> Any:
     """Return the JSON value in ``text``. Raises PayloadError for an infinite number, or a key twice in any spelling."""
-    import json  # the only reader that shows it, and only robots with groups pay for it
+    import json  # no other reader shows a key that is there twice; only robots with groups pay for it
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         fields = dict(pairs)

@@ -158,7 +158,7 @@ class Service:
             self._send(channel, topic, raw)
 
     def listen(self, channel: Channel, method: Callable[..., None], *, direct: bool = False) -> Subscription:
-        """Handle ``channel`` until the subscription is closed, as ``@on`` does for the whole run, also ``direct``."""
+        """Handle ``channel`` as ``@on`` does, also with its ``direct``, but only until the subscription is closed."""
 
         def deliver_direct(message: Message, value: Any, names: dict[str, str]) -> None:
             method(value, self.clock() - message.waited_s, **names)

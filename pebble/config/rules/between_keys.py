@@ -77,7 +77,7 @@ def _transport(reader: Reader, transport: TransportSection, path: Path) -> Trans
 
 def _bridge(reader: Reader, bridge: MqttBridge, path: Path) -> MqttBridge:
     notes, remote, link = reader.notes, bridge.remote, bridge.link
-    for section, command_of_unit in _COMMANDS_OF_UNIT.items():  # what to write for our unit of systemd
+    for section, command_of_unit in _COMMANDS_OF_UNIT.items():  # warns of commands taken over from the original
         words = " ".join(getattr(bridge, section).command)
         reasons = [reason for occurs_in, reason in _WORDS_OF_ORIGINAL if occurs_in(words)]
         if bridge.enabled and reasons:
