@@ -186,7 +186,7 @@ class Incoming:
         self._in_flight.pong(self.answered_at)
         self.age.delay.answered(self.answered_at)
 
-    def on_answer(self, mid: int, codes: bytes) -> None:
+    def on_answer(self, mid: int, codes: bytes) -> None:  # a SUBACK or UNSUBACK, see packets.Listener
         self._note_answer()
         answers = list(zip(self._in_flight.answer(mid), codes, strict=False))
         self.answers.update((filter_, code >= reasons.FAILURE) for filter_, code in answers)

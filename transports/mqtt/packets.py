@@ -300,7 +300,7 @@ class Reader:
         if not (first & RETAIN and payload_at < stop and self._listener.skips(topic)):  # an empty one is a removal
             self._listener.on_publication(topic, data[payload_at:stop], first)
 
-    def _other(self, first: int, body: bytes) -> None:
+    def _other(self, first: int, body: bytes) -> None:  # a packet that is neither a PUBLISH nor a whole PUBACK
         if first not in _SHORTEST or len(body) < _SHORTEST[first]:
             raise MalformedError(f"a packet that begins with {first:02x} and has {len(body)} bytes")
         if first in (_SUBACK, _UNSUBACK):

@@ -385,7 +385,7 @@ class MqttTransport(Transport):
         subscriptions = list(self._subscriptions)
         for filter_, is_refused in refused.items():
             for subscription in subscriptions:
-                if overlap(subscription.filter, filter_):  # of the broker's filters only the one that covers it does
+                if overlap(subscription.filter, filter_):  # then it is the broker's filter that covers the subscription
                     subscription.refused = is_refused
 
     def note_refusal(self, topic: str, why: str) -> None:

@@ -199,7 +199,7 @@ class ZenohTransport(Transport):
         """Process a change of hubs or connections; return the serial number of the working hub connection, 0 for none.
 
         The number grows with each hub that appears. ``linked``: the result of the last call, or 0 after an error;
-        ``seen``: the version of that call's view. If ``view`` is of the same version, only a failed try is repeated.
+        ``seen``: the version of that call's view. With the same version nothing has changed: a failed try is repeated.
         """
         if not view.hubs:
             self.problem = f"the hub of {self.settings.run_dir} is away"
@@ -271,8 +271,8 @@ class ZenohTransport(Transport):
         try:
             if message.retain:
                 self._hub.put(session, message, again=self._own.syncing)
-            # While `syncing`, messages that siblings have received before are sent to the hub again. Only a client's
-            # pending messages are new to others, which it reaches through the hub.
+            # While `syncing`, siblings have received these messages before: only the hub gets them again. But what a
+            # client has pending is new to all, as it reaches others through the hub alone.
             if not self._own.syncing:
                 self._publishers.put(session, message, urgent)
             elif self.settings.client and message.topic in self._own.pending:
