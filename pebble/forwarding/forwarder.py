@@ -316,9 +316,9 @@ class Forwarder:
         """Return an admitted message as it may pass, or why not: it is too late, or a script elsewhere sent it."""
         if subject.kind.one_shot and self._is_late(subject, message, forward, account):
             return Drop.LATE
-        if not forward.unsigned:  # here signed commands pass, too
+        if not forward.unsigned:  # a command may also pass with a script's signature
             return message
-        return self._without_script(source, message) or Drop.SIGNED
+        return self._without_script(source, message) or Drop.SIGNED  # SIGNED: a script elsewhere would move the robot
 
     def _is_late(self, subject: Subject, message: Message, forward: Forward, account: str) -> bool:
         """True if a command or action has waited for too long, unless it only ends something."""

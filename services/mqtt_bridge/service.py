@@ -146,7 +146,7 @@ class MqttBridge(ForwardingService):
         if self.config.security.named:
             filters.append(with_name(self._stop_topic, "+"))
         make = partial(StopConnection, transport, filters, self._pass_stop, self._forwards, self.clock)
-        if not self._is_thin:  # over a thin link this connection is worth its cost only while a client floods it
+        if not self._is_thin:  # a thin link carries this connection only while a client floods it, see ``wanted``
             return make(notices_s=self._silence_s + _NOTICED_S)
         transport.suit_link(thin=True)
         notices_s = max(self._silence_s, LEVELS["thin"].silent_s) + _NOTICED_S
@@ -340,7 +340,7 @@ class MqttBridge(ForwardingService):
             return
         if self._heartbeat is not None and message.topic == self._heartbeat.topic:
             if self._heartbeat.is_ours(message) and self.forwarder.gate is Gate.OPEN:
-                # one broker after all, or another program's heartbeat of the same millisecond
+                # it was sent to the other side: one broker after all, or another program's of the same millisecond
                 self.post_message(c.BRIDGE_PROBE, self._same_broker.send_again, newest_of="suspect")
             return
         if message.topic in self._owners.topics:
@@ -348,8 +348,8 @@ class MqttBridge(ForwardingService):
             self._follow_owner(self._owners.topics[message.topic], message.payload)
         if message.topic == self._control_topic:
             self._follow_control(message.payload)
-        if message.topic == self._stop_topic and not message.retain:  # the owners have it unless one restarts now
-            self._passed_stops.accept(named(message.payload), nameless=not is_named(message.payload))  # it gets a name
+        if message.topic == self._stop_topic and not message.retain:  # the owners have it, except one that restarts now
+            self._passed_stops.accept(named(message.payload), nameless=not is_named(message.payload))  # `named` adds it
         self._leftovers.note_local(message)
         for admitted in self._private.admit(message):
             self._react(Side.LOCAL, admitted, self.forwarder.receive(Side.LOCAL, admitted))

@@ -69,7 +69,7 @@ class Copies:
             if copy is not None:
                 expected.remove(copy)
                 if way is Way.MAIN:
-                    short = message.payload[:MAX_COMMAND_BYTES]  # if it is cut off it is still a stop, without a name
+                    short = message.payload[:MAX_COMMAND_BYTES]  # cut off it is a stop still, but has no name
                     self._dropped.append((now, Message(message.topic, short, message.qos)))
                 return True
             if comes_both_ways and not message.retain:  # with the flag it may be an old one, of which there is no copy

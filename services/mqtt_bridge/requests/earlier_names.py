@@ -199,10 +199,10 @@ class _Removal:
         for transport, topics in zip(self._sides, self._answers, strict=True):
             for topic in sorted(topics):
                 transport.publish(topic, b"", qos=QoS.DELIVERED, retain=True)
-        again = partial(self._ask, f"{self._name}/#", _note_retained, _ARRIVE_S, self._check)
+        again = partial(self._ask, f"{self._name}/#", _note_retained, _ARRIVE_S, self._note_remaining)
         self._call_in(_ARRIVE_S, again)
 
-    def _check(self) -> None:
+    def _note_remaining(self) -> None:
         remaining = [topic for topics in self._answers for topic in topics]
         remaining += [subscription.filter for subscription in self._subscriptions if subscription.refused]
         self._end()
