@@ -139,14 +139,16 @@ class Audit(Observer):
                 self.note(what, who, id=holder.id, device=holder.device)
 
     def estop(self, owner: str, state: EstopState) -> None:
-        """Add a row if the owner has refused a reset; its state shows only why it has refused the last one."""
+        """Add a row if the owner has refused a reset. All its states say why it has refused the last one, if it has."""
         why = state.reset_refused
-        before = self._refusals.get(owner, why)  # the first state that is seen may tell of an old refusal
+        if owner not in self._refusals:
+            self._refusals[owner] = why  # the first state that is seen may tell of an old refusal: it is no news
+        is_news = why != self._refusals[owner]
         is_answer = owner in self._awaited  # to the newest reset that passed here
         is_of_another = why == "boot" and len(self._owners) > 1  # a reset is for one owner's boot: all others refuse it
         self._refusals[owner] = why
         self._awaited.discard(owner)
-        if why and (is_answer or why != before) and not is_of_another:
+        if why and (is_answer or is_news) and not is_of_another:
             self.note("reset-refused", owner=owner, why=why)
 
     def unconfirmed(self, owner: str, stop: EstopCommand) -> None:

@@ -264,10 +264,11 @@ class Control:
         if not self._may("reset", op) or robot is None:
             return
         reset = Reset(robot.estop, self._session.user)
-        known, reset.shown = reset.shown, {}  # refilled with the stops that the page has shown
+        newest = reset.shown  # by owner: the stops that are known here
+        reset.shown = {}  # and those that are reset: the same, with boot and count as the page has shown them
         for shown in op.owners:
-            if shown.owner in known:
-                reset.shown[shown.owner] = replace(known[shown.owner], boot=shown.boot, count=shown.count)
+            if shown.owner in newest:
+                reset.shown[shown.owner] = replace(newest[shown.owner], boot=shown.boot, count=shown.count)
         for message in reset.messages():
             self._server.broker.publish(message.topic, message.payload, qos=message.qos)
         self._audit("reset", op.ref)

@@ -172,7 +172,7 @@ class OpenComponents:
     def _filters(self, ref: str) -> _Filters:
         """Return the topics of an open component: the contract's, those it names, and drawings over its picture.
 
-        A topic that has a meaning keeps it, unless it is that of a flag.
+        Of several meanings of one topic the first counts, but that of a flag in any case.
         """
         filters: _Filters = {channel.filter(ref): None for channel in WATCHED}  # None: the names tell the meaning
         for channel in _NAMED:

@@ -146,12 +146,12 @@ class Robots:
         dirty, interest.dirty = interest.dirty, set()
         taken: list[tuple[str, str, Any, float]] = []
         has_large, room = False, MAX_STATE_BYTES
-        for ref, metric in sorted(dirty, key=lambda key: key[0] != interest.watched):
+        for ref, metric in sorted(dirty, key=lambda key: key[0] != interest.watched):  # False, which is watched, first
             stored = self._find(ref, metric)
             size = 0 if stored is None else len(bytes(stored.raw))
             is_large = size > LARGE_BYTES
             if room <= 0 or (is_large and (has_large or not large)):
-                interest.dirty.add((ref, metric))
+                interest.dirty.add((ref, metric))  # for the next message
                 continue
             has_large = has_large or is_large
             room -= size
@@ -259,7 +259,7 @@ class Robots:
         for component in self.components.values():
             waited_s = now - component.refreshed_at  # infinite: nothing was sent yet
             changed = component.robot.online(now) is not component.sent_online or waited_s == float("inf")
-            has_ages = component.robot.live or component.sent_online is not None  # else no age is known
+            has_ages = component.robot.live or component.sent_online is not None  # else nothing that grows older
             is_open = component.ref in opened
             if changed or (has_ages and is_open and waited_s >= _REFRESH_S):
                 self._refresh(component, now)
@@ -277,7 +277,10 @@ class Robots:
             self._mark(component.ref, c.ONLINE.metric)
 
     def _add(self, ref: str) -> Component | None:
-        """Add a component; None if the table is full. A wanted one replaces the newest that need not be kept."""
+        """Add a component; None if the table is full.
+
+        A wanted one replaces the newest that need not be kept; where all are kept, it is one more.
+        """
         if len(self.components) >= MAX_COMPONENTS:
             if not self.omitted:
                 log.warning("more than %d components at this broker: give it accounts", MAX_COMPONENTS)
@@ -287,7 +290,7 @@ class Robots:
             newest = next((other for other in reversed(self.components) if not self.is_kept(other)), None)
             if newest is not None:
                 self.forget(newest)
-            self.on_forget(ref)  # its earlier messages found no place: they are asked for again
+            self.on_forget(ref)  # its earlier messages were omitted: the retained ones are asked for again
         component = self.components[ref] = Component(ref)
         return component
 
@@ -374,6 +377,7 @@ class Robots:
         channel = _channel(metric)
         everybody = everybody or channel in FLEET
         for interest in self.interests:
+            # drawings over the picture of ``ref``, which this page shows for the component that it has open
             is_drawn = channel is c.VIDEO_OVERLAYS and self.sources.get(interest.watched) == ref
             if everybody or is_drawn or interest.watched == ref:
                 interest.dirty.add((ref, metric))

@@ -185,7 +185,7 @@ def remove(name: _Name, folder_: _Folder = None) -> int:
     with _locked_fleet(folder_) as (place, fleet):
         account = _account(place, fleet, name)
         after = fleet.without(name)
-        is_person = not set(account.roles) & set(ProgramRole)
+        is_person = not set(account.roles) & set(ProgramRole)  # it has no role of a program
         unfinished = list(_remove_from_pages(fleet, name)) if is_person else []
         unfinished += _copies(place, after)
         try:
@@ -279,7 +279,7 @@ def apply_(folder_: _Folder = None) -> int:
         unfinished = list[str]()
         if fleet.rules == "plugin":
             fleet, unfinished = plugin.convert(place, fleet)
-        if applying.obeys_plugin(place):
+        if applying.obeys_plugin(place):  # it reads no files before mosquitto.conf is changed
             unfinished += applying.conf_differences(place, fleet)
         else:
             typer.echo(f"{_shown(place)} knows {len(fleet.accounts)} accounts ({applying.apply(place, fleet)})")

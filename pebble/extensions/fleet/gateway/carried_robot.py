@@ -106,11 +106,11 @@ def _subscribe(robots: Sequence["CarriedRobot"], side: Side, transport: Transpor
     handlers: dict[str, Handler] = {}
     for robot in robots:
         handlers |= robot.subscribing(side, *below)
-    subscriptions = iter(transport.subscribe_all(handlers, echo=False, direct=True))
+    subscriptions = iter(transport.subscribe_all(handlers, echo=False, direct=True))  # in the order of ``handlers``
     if side is Side.REMOTE:  # some brokers send retained messages only for exact names
         transport.ask([flag for robot in robots for flag in robot.subjects.flags])
     for robot in robots:
-        robot.subscribed(side, islice(subscriptions, len(below)))  # the next ones, as in ``handlers``
+        robot.subscribed(side, islice(subscriptions, len(below)))  # takes those of this robot
 
 
 class CarriedRobot:
