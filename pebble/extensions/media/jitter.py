@@ -276,7 +276,7 @@ class JitterBuffer:
             estimate, self._spare = self._spare[:size], self._spare[size:]
             return estimate
         length = len(last.samples)
-        steps = (self._concealed + np.arange(size)) % (2 * length)  # on the way back and forth
+        steps = (self._concealed + np.arange(size)) % (2 * length)  # from the end of ``last`` back, then forth again
         return last.samples[np.where(steps < length, length - 1 - steps, steps - length)]
 
 

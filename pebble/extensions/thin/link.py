@@ -73,7 +73,7 @@ class Crowd:
         self._contrary_since: float | None = None  # when measurements began to contradict ``stands``
 
     def note(self, queue_s: float, now: float) -> None:
-        """Note how much longer answers take than the fastest; after contradicting it for a time, change ``stands``."""
+        """Note how much longer answers take than the fastest; after some time of contradiction, change ``stands``."""
         contradicts = queue_s < _DRAINED_S if self.stands else queue_s > _STANDING_S
         if not contradicts:
             self._contrary_since = None

@@ -197,6 +197,7 @@ class ControlClient:
         for_ms: float = WIDE.control_for_ms,
         t: int | UnsetType = UNSET,
     ) -> Message:
+        """Return a request on CONTROL or CONTROL_TAKE; ``t``: the time stamp, where the link's pace wants one."""
         request = ControlRequest(id=self.id, want=want, for_ms=for_ms, by=self._by, device=self._device, t=t)
         return Message(channel.topic(self.robot.base), codec.encode(channel, request), QoS(channel.default_qos))
 
