@@ -169,7 +169,7 @@ class Catalogue:
         version = entry, stamp(entry), stamp(folder / MANIFEST)
         version_before, before, until = self._answers.get(name, (None, _Answer(Description()), 0.0))
         is_current = version_before == version and self._clock() < until
-        if is_current or (version_before is not None and not asks):  # unasked, its old answer counts
+        if is_current or (version_before is not None and not asks):  # not to be asked now: its last answer counts
             return before
         answer = self._describe(folder, entry, section, asks=asks)
         if not answer.asked:  # it is asked later: nothing to keep

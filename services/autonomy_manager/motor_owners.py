@@ -87,8 +87,8 @@ class MotorOwners:
             boot, count, barred = baseline.setdefault(owner, (state.boot, state.count, 0))
             if state.latched or (state.boot == boot and state.count != count):
                 return _stopped(owner, state)
-            # An owner bars all runs up to a number: that before a run that begins, or the newest as a person drives.
-            # ``barred`` is the number up to which it had barred runs before this one began.
+            # An owner bars all runs up to ``last_barred``: when a run begins, up to the number before it; when a person
+            # drives, up to the newest run. ``barred`` is what it was before this run began.
             is_barred = state.last_barred != barred and not newer(run, state.last_barred)
             if signs and is_barred:
                 # A newer run has begun if one is barred, or a command of one was received.

@@ -208,6 +208,7 @@ class CmdVel:
         self._due = due
 
     def _run(self) -> None:
+        """Send what is due: the newest command while it is valid, then zeros; while stopped, zeros with the lock."""
         with self._changed:
             while not self._ends:
                 now = time.monotonic()

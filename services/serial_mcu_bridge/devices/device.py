@@ -110,7 +110,7 @@ class Device:
         if self.claims.granted.get(claim) != interface.name:
             return None
         channel = self._robots_channel(claim)
-        if channel in (c.IMU_FAST, c.IMU):
+        if channel in (c.IMU_FAST, c.IMU):  # the contract has these, with the body of their profile
             return Alias(claim, channel, interface.profile)
         new_channel = _channel(interface.channel, interface.kind, payload, retain=interface.retain)
         # What must stay on the robot keeps the generic body: the MQTT bridge recognises it by the device named in it.
