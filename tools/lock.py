@@ -44,11 +44,11 @@ def main() -> None:
     upgrade = ["--upgrade"] if "--upgrade" in sys.argv[1:] else []
     compiled("pyproject.toml", "-", *EVERYTHING, "--generate-hashes", "--output-file", str(LOCK), *upgrade)
     text = LOCK.read_text()
-    within = ("--constraint", str(LOCK))
-    kinds = {
-        kind: set(NAME.findall(compiled("pyproject.toml", "-", *within, *(f"--extra={extra}" for extra in extras))))
-        for kind, extras in KINDS.items()
-    }
+    within = ("--constraint", str(LOCK))  # the versions that were chosen above
+    kinds: dict[str, set[str]] = {}  # by kind of installation: the names of its packages
+    for kind, extras in KINDS.items():
+        options = [f"--extra={extra}" for extra in extras]
+        kinds[kind] = set(NAME.findall(compiled("pyproject.toml", "-", *within, *options)))
     kinds[TOOLS] = set(NAME.findall(compiled("--group", TOOLS, *within)))
     packages = re.split(r"^(?=[a-z0-9])", text, flags=re.MULTILINE)
     for number, package in enumerate(packages):

@@ -310,18 +310,19 @@ class Trial:
     def attempt(self, record: dict[str, Any], reached_by: set[tuple[str, int]], text: bytes) -> dict[str, Any]:
         """Run rows with a mutant; write the result, and return it."""
         start, file = time.monotonic(), record["file"]
-        script = file.endswith(".js")
+        is_script = file.endswith(".js")  # a page module: the tests read it from the tree, no function is exchanged
         # Functions whose code a fork can exchange; none if the line runs while tests are imported. Without any, all
         # rows run with the changed file instead.
-        swaps = [] if script or reached_by & self.imported else self.swaps(file, text)
+        swaps = [] if is_script or reached_by & self.imported else self.swaps(file, text)
         names = [name for name in self.rows if not swaps or reached_by & self.lines[name]]
         seconds = sum(self.rows[name][0] for name in names)  # which they took without a mutant
         # a row may now have to set up what its module shares: at most what the module's slowest row took
-        seconds += sum(self.slowest[path] for path in {self.items[name].path for name in names})
+        modules = {self.items[name].path for name in names}
+        seconds += sum(self.slowest[module] for module in modules)
         self.failed.write_text("")
-        if script:
+        if is_script:
             (self.tree / file).write_bytes(text)
-        in_fork = swaps or script
+        in_fork = swaps or is_script
         work = (lambda: self.run_swapped(swaps, names)) if in_fork else (lambda: self.run_new(file, text))
         result = "not reached"
         if names:
