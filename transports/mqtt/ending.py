@@ -1,6 +1,15 @@
 """Reasons why a connection to an MQTT broker could not be made, or has ended."""
 
+import ssl
+from typing import Final
+
 from pebble.transports.mqtt.bridge_mode import Result
+
+#: How to mend a certificate that is refused, by OpenSSL's number of the reason; by default its authority is not known.
+_CERTIFICATE: Final = {10: "renew it", 62: "name the host as it does", 64: "name the host as it does"}
+_UNKNOWN: Final = "name its authority: --ca-cert FILE, or tls.ca_cert in a config"
+#: What to do if a broker hangs up on a CONNECT without TLS.
+WANTS_TLS: Final = "if this port is for TLS: mqtts://, or tls.enabled in a config"
 
 
 class Lost(Exception):  # noqa: N818  (an event, not a mistake)
@@ -25,3 +34,15 @@ class Refused(Lost):
     def __init__(self, text: str, result: Result = Result.FAILED) -> None:
         super().__init__(text)
         self.result = result
+
+
+def unreached(error: Exception, *, tls: bool) -> str:
+    """Return in words why a broker cannot be reached, with what to do if that is known."""
+    if isinstance(error, ConnectionRefusedError):
+        return "nothing listens there, is it up?"
+    if isinstance(error, ssl.SSLCertVerificationError):
+        fix = _CERTIFICATE.get(error.verify_code, _UNKNOWN)
+        return f"its certificate is refused: {error.verify_message.rstrip('.')}; {fix}"
+    if tls and (isinstance(error, ConnectionError | ssl.SSLEOFError) or "WRONG_VERSION" in str(error)):
+        return "this port is not for TLS: use mqtt://, or the port for TLS (8883)"
+    return str(error)

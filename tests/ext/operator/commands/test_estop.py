@@ -25,7 +25,7 @@ from tests.ext.page.served import Served
 from tests.fakes.bad_brokers import BEHAVIOURS, resolving, serving
 from tests.kit.played_robot import RecordingRobot
 from tests.sparing_broker import SparingBroker
-from tests.support import WAIT_S, Broker, free_port, quickly, until
+from tests.support import WAIT_S, Broker, free_port, until
 from tests.tcp_proxy import TcpProxy
 
 _numbers = itertools.count(1)
@@ -244,14 +244,10 @@ def brittle(tmp_path: Path) -> Iterator[Broker]:
     broker.stop()
 
 
-def await_outage(process: subprocess.Popen[str]) -> None:
+def await_stop(process: subprocess.Popen[str], broker: Broker, robot: RecordingRobot, waits: str) -> None:
+    """Start the broker once the command says that it ``waits``, and await the confirmation."""
     assert process.stderr is not None
-    assert process.stderr.readline().startswith("pebble: warning: nothing is sent until there is a connection: ")
-
-
-def await_stop(process: subprocess.Popen[str], broker: Broker, robot: RecordingRobot) -> None:
-    """Start the broker once the command says that it waits, and await the confirmation."""
-    await_outage(process)
+    assert process.stderr.readline().startswith(f"pebble: {waits}")
     robot.deaf = False
     broker.start()
     out, _ = process.communicate(timeout=50)
@@ -266,26 +262,74 @@ def test_a_lost_broker_is_waited_for(brittle: Broker) -> None:
         with running("estop", robot.id, f"--url=mqtt://127.0.0.1:{brittle.port}") as process:
             assert until(lambda: robot.count("estop") >= 1)
             brittle.kill()
-            await_stop(process, brittle, robot)
+            await_stop(process, brittle, robot, "warning: nothing is sent until there is a connection: ")
 
 
 def test_a_broker_that_restarts_is_waited_for(brittle: Broker) -> None:
     with RecordingRobot(brittle.port, "pebble/robots/lost", heartbeats=False) as robot:
         brittle.kill()
         with running("estop", robot.id, f"--url=mqtt://127.0.0.1:{brittle.port}") as process:
-            await_stop(process, brittle, robot)
+            await_stop(process, brittle, robot, "the stop is NOT SENT YET: connecting to mqtt://127.0.0.1:")
 
 
-def test_without_a_broker_nothing_is_sent_and_that_is_said(run: Run) -> None:
-    nowhere = f"--url=mqtt://127.0.0.1:{free_port()}"
-    with quickly(WAIT_S):  # half the time for which a stop is repeated
-        assert run("estop", "--all", nowhere) == 1
-    assert run.err.startswith("pebble: cannot connect to ")
-    with running("estop", "goob", nowhere) as process:
-        await_outage(process)
+NOWHERE = "nothing listens there, is it up?"
+REFUSED = "not authorized (bad user name or password?)"
+#: Command lines whose broker, or robot, does not let them in: how it answers, the first line, a later signal, the end.
+UNREACHED: dict[str, tuple[list[str], str | None, str, str, signal.Signals | None, str]] = {
+    "one": (["goob"], None, "the stop is NOT SENT YET: connecting to", NOWHERE, signal.SIGINT, "STOP NOT SENT: interr"),
+    "ended": (["goob"], "mute", "the stop is NOT SENT YET: connecting to", "", signal.SIGTERM, "STOP NOT SENT: interr"),
+    "all": (["--all"], None, "the stop is NOT SENT YET: connecting to", NOWHERE, None, "STOP NOT SENT: cannot connect"),
+    "who": (["--all"], "not authorized", "the stop is NOT SENT YET: connecting to", REFUSED, None, REFUSED),
+    "reset": (
+        ["reset", "goob"],
+        None,
+        "nothing is reset yet: connecting to",
+        NOWHERE,
+        signal.SIGINT,
+        "NOT RESET: interr",
+    ),
+}
+
+
+@pytest.mark.parametrize(("words", "how", "begins", "why", "ends_by", "ends"), UNREACHED.values(), ids=UNREACHED)
+def test_without_a_connection_a_stop_and_a_reset_say_at_once_and_in_the_end_that_they_are_not_sent(
+    words: list[str], how: str | None, begins: str, why: str, ends_by: signal.Signals | None, ends: str
+) -> None:
+    port = free_port()
+    with ExitStack() as opened:
+        if how is not None:
+            opened.enter_context(serving("127.0.0.1", port, BEHAVIOURS[how]))
+        process = opened.enter_context(running("estop", *words, f"--url=mqtt://127.0.0.1:{port}"))
+        assert process.stderr is not None
+        first = process.stderr.readline()
+        if ends_by is not None:
+            process.send_signal(ends_by)
+        _, err = process.communicate(timeout=WAIT_S)
+    assert first.startswith(f"pebble: {begins} mqtt://127.0.0.1:{port}")
+    assert (process.returncode, why in first, ends in err, "Traceback" in err) == (1, True, True, False), first + err
+
+
+def test_a_stop_that_waits_for_a_broker_says_why_until_it_is_ended() -> None:
+    with running("estop", "goob", f"--url=mqtt://127.0.0.1:{free_port()}") as process:
+        assert process.stdout is not None
+        waits = process.stdout.readline()
         process.send_signal(signal.SIGINT)
         out, _ = process.communicate(timeout=WAIT_S)
-    assert (process.returncode, out) == (1, "goob: STOP NOT SENT: there was no connection\n")
+    assert (process.returncode, waits.startswith("goob: STOP NOT SENT YET: ")) == (1, True)
+    assert out == waits.replace(" YET", "")
+
+
+@pytest.mark.parametrize("place", ["target_of", "_repeat"])
+def test_a_stop_says_also_after_an_error_whether_it_was_sent(
+    run: Run, monkeypatch: pytest.MonkeyPatch, broker: Broker, url: str, place: str
+) -> None:
+    def fail(*_: object) -> None:
+        raise ValueError("a mistake")
+
+    monkeypatch.setattr(estop, place, fail)
+    assert run("estop", "nobody", url) == 1
+    assert ("STOP NOT SENT: an unexpected error" in run.err) is (place == "target_of")
+    assert (run.out.startswith("nobody: ") and " NOT " in run.out) is (place == "_repeat")
 
 
 #: What a broker keeps, too long to arrive, of a stranger or of the robot itself, and who stops the robot all the same.
@@ -440,7 +484,7 @@ def test_a_stop_that_was_not_shown_is_not_reset(robot_on: Make, url: str) -> Non
 def test_a_reset_of_an_unknown_robot_is_a_failure(run: Run, url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(estop, "_ANSWER_S", 0.3)
     assert run("estop", "reset", "unknown", url) == 1
-    assert run.err == "pebble: unknown publishes no emergency stop: is it on, and is this its broker?\n"
+    assert run.err == "pebble: NOT RESET: unknown publishes no emergency stop: is it on, and is this its broker?\n"
 
 
 def test_status_of_all(run: Run, robot_on: Make, url: str) -> None:
