@@ -457,7 +457,8 @@ def _status(target: Target, *, every: bool) -> int:
             transport.ask([topic for robot in discovery.all_robots() for topic in robot.estop.missing])
         if is_remote:
             began = time.monotonic()  # until each robot has sent a heartbeat, or counts as silent
-            wait_for(lambda: not discovery.awaits_heartbeat(time.monotonic() - began), float("inf"))
+            with noticed(lambda: "waiting for heartbeats"):
+                wait_for(lambda: not discovery.awaits_heartbeat(time.monotonic() - began), float("inf"))
             wait_for(lambda: not any(robot.live and robot.estop.lacks for robot in discovery.all_robots()), _ANSWER_S)
         robots = sorted(discovery.all_robots(), key=lambda robot: robot.base)
     for robot in robots:
