@@ -448,10 +448,14 @@ def test_a_handshake_may_take_long_while_bytes_arrive(tls_broker: Broker, goes_o
     ("host", "changes", "problem"),
     [
         ("127.0.0.1", {}, "not valid for '127.0.0.1'; name the host as it does"),  # it names localhost
-        ("localhost", {"ca_cert": "other-ca.crt", "insecure": True}, "; name its authority: --ca-cert FILE"),
+        (
+            "localhost",
+            {"ca_cert": "other-ca.crt", "insecure": True},
+            "; name its authority: --ca-cert FILE, tls.ca_cert",
+        ),
         ("localhost", {"client_cert": None, "client_key": None}, ""),  # the broker wants one
         ("localhost", None, "if this port is for TLS: mqtts://"),
-        ("plain", {}, "this port is not for TLS: use mqtt://"),
+        ("plain", {}, "this port is not for TLS; use mqtt://"),
     ],
 )
 def test_tls_checks_host_name_and_authority_and_shows_a_certificate(

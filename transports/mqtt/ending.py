@@ -5,11 +5,13 @@ from typing import Final
 
 from pebble.transports.mqtt.bridge_mode import Result
 
-#: How to mend a certificate that is refused, by OpenSSL's number of the reason; by default its authority is not known.
-_CERTIFICATE: Final = {10: "renew it", 62: "name the host as it does", 64: "name the host as it does"}
-_UNKNOWN: Final = "name its authority: --ca-cert FILE, or tls.ca_cert in a config"
-#: What to do if a broker hangs up on a CONNECT without TLS.
+#: What to do if a broker hangs up on a CONNECT without TLS, and if it hangs up on TLS.
 WANTS_TLS: Final = "if this port is for TLS: mqtts://, or tls.enabled in a config"
+_NO_TLS: Final = "use mqtt://, or the port for TLS (8883)"
+#: How to mend a certificate that is refused, by OpenSSL's number of the reason; by default its authority is not known.
+_OTHER_NAME, _EXPIRED, _UNKNOWN = "name the host as it does", "renew it", "name its authority: --ca-cert FILE, tls.ca_cert"
+_CERTIFICATE: Final = {10: _EXPIRED, 62: _OTHER_NAME, 64: _OTHER_NAME}
+TLS_FIXES: Final = (WANTS_TLS, _NO_TLS, _OTHER_NAME, _EXPIRED, _UNKNOWN)
 
 
 class Lost(Exception):  # noqa: N818  (an event, not a mistake)
@@ -44,5 +46,5 @@ def unreached(error: Exception, *, tls: bool) -> str:
         fix = _CERTIFICATE.get(error.verify_code, _UNKNOWN)
         return f"its certificate is refused: {error.verify_message.rstrip('.')}; {fix}"
     if tls and (isinstance(error, ConnectionError | ssl.SSLEOFError) or "WRONG_VERSION" in str(error)):
-        return "this port is not for TLS: use mqtt://, or the port for TLS (8883)"
-    return str(error)
+        return f"this port is not for TLS; {_NO_TLS}"
+    return getattr(error, "strerror", None) or str(error)
