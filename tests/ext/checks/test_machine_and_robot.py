@@ -155,7 +155,7 @@ OUTSIDE = "127.0.0.2"  # stands for the machine's address on the network
 PLACES = [
     (True, False, State.WARN, f"also answers at {OUTSIDE} and accepts anonymous logins: the network can drive"),
     (True, True, State.OK, f"also answers at {OUTSIDE}, and refuses anonymous logins there"),
-    (False, False, State.OK, f"does not answer at {OUTSIDE}, ::1"),
+    (False, False, State.OK, f"serves this machine only: nothing answers at {OUTSIDE}, ::1"),
 ]
 
 
@@ -280,8 +280,12 @@ def test_a_whole_robot_is_examined(tmp_path: Path, broker: Broker) -> None:
     failed = [finding.what.split(" ")[0] for finding in findings if finding.state is State.FAILED]
     assert failed == ["serial", "remote"]
     assert {"memory lock", "clock", "state directory"} <= {finding.what for finding in findings}
-    tried = {finding.text for finding in findings if finding.text.startswith("does not answer at")}
-    assert tried == ({f"does not answer at {', '.join(login.own_addresses())}"} if login.own_addresses() else set())
+    tried = {finding.text for finding in findings if "nothing answers at" in finding.text}
+    assert tried == (
+        {f"serves this machine only: nothing answers at {', '.join(login.own_addresses())}"}
+        if login.own_addresses()
+        else set()
+    )
     assert [finding for finding in findings if finding.state is not State.OK and not finding.fix] == []
 
 

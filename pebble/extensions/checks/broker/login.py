@@ -115,7 +115,7 @@ def beyond_loopback(name: str, settings: MqttSettings, addresses: Iterable[str])
     elif answering:
         yield ok(f"also answers at {', '.join(answering)}, and refuses anonymous logins there", what=what)
     elif answers:
-        yield ok(f"does not answer at {', '.join(answers)}", what=what)
+        yield ok(f"serves this machine only: nothing answers at {', '.join(answers)}", what=what)
 
 
 def own_addresses() -> list[str]:

@@ -18,6 +18,7 @@ import typer
 
 from pebble.config.visible import shown
 from pebble.contract import CAPABILITIES, ESTOP_STATE, LINK, ONLINE, STATUS
+from pebble.contract.identity import parse_topic
 from pebble.contract.levels import LEVELS
 from pebble.errors import PebbleError, TransportError
 from pebble.extensions.operator.client.connection import (
@@ -54,6 +55,8 @@ _ON_ITS_WAY_S = 0.05  # between the thread that has received a message and this 
 _REPORT_PERIOD_S = 0.05
 _NOTICE_S = 0.15  # without a connection, until a line says so; the program itself starts in 0.3 s
 _QUICK_S = 1.0  # an answer within this time needs no line before it
+_OTHERS_S = 3.0  # for heartbeats of other robots
+_NAMED = 8  # robots in one line
 _ANSWER_S = LEVELS["wide"].answer_s  # longest wait for what the broker has of a robot
 _BATCH = 1000  # messages that are handled before the next stop is due
 
@@ -185,8 +188,11 @@ def _stop(robot: str | None, target: Target, why: str, *, hold: bool) -> int:
 def _repeat(target: Target, bases: list[str], sender: StopSender, outbox: _Outbox, report: _Report) -> None:
     """Repeat stops until they are confirmed. Listen on a second connection: what arrives delays none of them."""
     every = not sender.order.named
-    with _heartbeats(target, every=every) as heartbeats, listening(target, outbox.transport) as second:
+    with ExitStack() as opened:
+        heartbeats = opened.enter_context(_heartbeats(target, every=every))
+        second = opened.enter_context(listening(target, outbox.transport))
         listener, subscribing = _listen(second, bases)
+        others = None if every else _OtherRobots(target, sender, opened)
         while not sender.finished:
             for message in heartbeats.take() if heartbeats else ():
                 sender.receive(message, time.monotonic())
@@ -196,6 +202,8 @@ def _repeat(target: Target, bases: list[str], sender: StopSender, outbox: _Outbo
             outbox.publish()
             report.connection(outbox.problem)
             report.update(time.monotonic())
+            if others is not None:
+                others.look(time.monotonic())
         # by the robot's status the report says whether the motors obey: it may come after the confirmation
         subscribing.join(_ANSWER_S)
         wait_for(lambda: second.state is State.CONNECTED, _ANSWER_S)
@@ -222,6 +230,30 @@ def _heartbeats(target: Target, *, every: bool) -> Iterator[Heartbeats | None]:
         return
     with closing(Heartbeats(in_small_segments(settings))) as heartbeats:
         yield heartbeats
+
+
+class _OtherRobots:
+    """The robots that are heard while nothing comes from the one to be stopped: its name may be mistyped."""
+
+    def __init__(self, target: Target, sender: StopSender, opened: ExitStack) -> None:
+        self._target, self._sender, self._opened = target, sender, opened
+        self._due = time.monotonic() + _QUICK_S
+        self._heartbeats: Heartbeats | None = None
+
+    def look(self, now: float) -> None:
+        """Once nothing has come for long enough, listen to others; name them in one line a little later."""
+        if now < self._due or any(robot.live or robot.estop.has_capabilities for robot in self._sender.robots.values()):
+            return
+        if self._heartbeats is None:
+            self._heartbeats = self._opened.enter_context(_heartbeats(self._target, every=True))
+            self._due = float("inf") if self._heartbeats is None else now + _OTHERS_S
+            return
+        self._due = float("inf")
+        addresses = (parse_topic(message.topic) for message in self._heartbeats.take())
+        names = sorted({id_of(address.identity.base) for address in addresses if address is not None})
+        if names:
+            name, more = id_of(next(iter(self._sender.robots))), ", …" if len(names) > _NAMED else ""
+            _echo(shown(f"pebble: nothing comes from {name}; heard here: {', '.join(names[:_NAMED])}{more}"), err=True)
 
 
 def _drop_other_spelling(sender: StopSender) -> None:
@@ -316,7 +348,7 @@ class _Report:
         sender = self._sender
         self._print(is_early=False)
         if not sender.robots:
-            _echo("no robot was found: NOTHING IS STOPPED")
+            _echo("no robot was heard: NOTHING IS STOPPED")
         if sender.omitted:
             _echo(f"there are more than {len(sender.robots)} robots: the others got the stop, NOT CONFIRMED")
 

@@ -173,6 +173,14 @@ def test_a_robot_that_does_not_answer_is_reported_and_ctrl_c_ends_it(robot_on: M
     assert robot.count("estop") == robot.count("drive-values") >= 2
 
 
+def test_the_robots_that_are_heard_are_named_where_the_one_that_is_meant_is_not(robot_on: Make, url: str) -> None:
+    robot = robot_on("serial")
+    robot.start()
+    with running("estop", "gob", url) as process:
+        assert process.stderr is not None
+        assert process.stderr.readline() == f"pebble: nothing comes from gob; heard here: {robot.id}\n"
+
+
 def test_a_stop_is_repeated_until_it_is_confirmed_although_nothing_can_be_printed(robot_on: Make, url: str) -> None:
     robot = robot_on("serial")
     robot.deaf = True
