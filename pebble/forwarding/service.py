@@ -118,7 +118,8 @@ class ForwardingService(Service, ABC):
         return self.forwarder.dropped()
 
     def stop(self) -> None:
-        self.log.info("forwarded and dropped: %s", self.forwarder.counters.snapshot())
+        counts = self.forwarder.counters.snapshot()
+        self.log.info("messages: %s", ", ".join(f"{name} {count}" for name, count in counts.items()) or "none")
 
     # -- the service's thread
 

@@ -11,15 +11,20 @@ from pebble.config.visible import shown
 PATIENCE_S = 1.0  # for which a command may be silent
 
 
+def say(text: str) -> None:
+    """Print a line to stderr."""
+    with suppress(OSError):  # nobody reads it
+        sys.stderr.write(f"pebble: {shown(without_secrets(text))}\n")
+        sys.stderr.flush()
+
+
 @contextmanager
 def noticed(line: Callable[[], str], after_s: float = PATIENCE_S) -> Iterator[None]:
     """Print ``line()`` to stderr if the block takes longer than ``after_s``; nothing if it is empty by then."""
 
     def write() -> None:
         if text := line():
-            with suppress(OSError):  # nobody reads it
-                sys.stderr.write(f"pebble: {shown(without_secrets(text))}\n")
-                sys.stderr.flush()
+            say(text)
 
     timer = threading.Timer(after_s, write)
     timer.daemon = True

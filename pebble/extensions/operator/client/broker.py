@@ -118,6 +118,19 @@ class Broker:
         """Call ``watcher`` whenever the connection is made or lost."""
         self._watchers.append(watcher)
 
+    def report(self, say: Callable[[str], None]) -> None:
+        """Give ``say`` a line if there is no connection, and from now on when it is lost, and when it is made again."""
+        reported = True  # the state in the last line
+
+        def note() -> None:
+            nonlocal reported
+            if self.connected is not reported and self.transport.state is not State.CLOSED:
+                reported = self.connected
+                say("connected to the broker" if reported else f"{self.problem} (trying again)")
+
+        self.on_state(note)
+        note()
+
     def publish(
         self,
         topic: str,
