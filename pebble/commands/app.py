@@ -159,11 +159,8 @@ def _run(arguments: list[str]) -> int:
 
         wrong = without_secrets(message).replace("float range", "number").replace("int range", "whole number")
         file = message.rpartition("(")[2].rstrip(")")  # of an argument too many
-        if (
-            file.endswith(".json")
-            and Path(file).is_file()
-            and any("-c" in option.opts for option in context.command.params)
-        ):
+        options = () if context is None else context.command.params
+        if file.endswith(".json") and Path(file).is_file() and any("-c" in option.opts for option in options):
             wrong += f": use -c {file}"
         sys.stderr.write(f"pebble: {wrong}; see {context.command_path if context else 'pebble'} --help\n")
         return 2

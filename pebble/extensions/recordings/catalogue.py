@@ -38,7 +38,7 @@ class FileInfo:
 
     @property
     def notes(self) -> int:
-        """How many of the messages are the recorder's own."""
+        """Return how many of the messages are notes of the recorder."""
         return self.topics[EVENTS] + self.topics[FORGET]
 
     @property
