@@ -9,7 +9,11 @@ from pebble.transports.mqtt.bridge_mode import Result
 WANTS_TLS: Final = "if this port is for TLS: mqtts://, or tls.enabled in a config"
 _NO_TLS: Final = "use mqtt://, or the port for TLS (8883)"
 #: How to mend a certificate that is refused, by OpenSSL's number of the reason; by default its authority is not known.
-_OTHER_NAME, _EXPIRED, _UNKNOWN = "name the host as it does", "renew it", "name its authority: --ca-cert FILE, tls.ca_cert"
+_OTHER_NAME, _EXPIRED, _UNKNOWN = (
+    "name the host as it does",
+    "renew it",
+    "name its authority: --ca-cert FILE, tls.ca_cert",
+)
 _CERTIFICATE: Final = {10: _EXPIRED, 62: _OTHER_NAME, 64: _OTHER_NAME}
 TLS_FIXES: Final = (WANTS_TLS, _NO_TLS, _OTHER_NAME, _EXPIRED, _UNKNOWN)
 
