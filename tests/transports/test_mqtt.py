@@ -455,7 +455,7 @@ def test_a_handshake_may_take_long_while_bytes_arrive(tls_broker: Broker, goes_o
         ),
         ("localhost", {"client_cert": None, "client_key": None}, ""),  # the broker wants one
         ("localhost", None, "if this port is for TLS: mqtts://"),
-        ("plain", {}, "this port is not for TLS; use mqtt://"),
+        ("plain", {}, "it takes no TLS at this port; use mqtt://"),
     ],
 )
 def test_tls_checks_host_name_and_authority_and_shows_a_certificate(

@@ -50,5 +50,5 @@ def unreached(error: Exception, *, tls: bool) -> str:
         fix = _CERTIFICATE.get(error.verify_code, _UNKNOWN)
         return f"its certificate is refused: {error.verify_message.rstrip('.')}; {fix}"
     if tls and (isinstance(error, ConnectionError | ssl.SSLEOFError) or "WRONG_VERSION" in str(error)):
-        return f"this port is not for TLS; {_NO_TLS}"
+        return f"it takes no TLS at this port; {_NO_TLS}"
     return getattr(error, "strerror", None) or str(error)

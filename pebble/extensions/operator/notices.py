@@ -9,6 +9,7 @@ from pebble.config.secret_text import without_secrets
 from pebble.config.visible import shown
 
 PATIENCE_S = 1.0  # for which a command may be silent
+_LAST_S = 0.1  # for a line that is being printed: a terminal that stands still holds up nothing else
 
 
 def say(text: str) -> None:
@@ -33,4 +34,4 @@ def noticed(line: Callable[[], str], after_s: float = PATIENCE_S) -> Iterator[No
         yield
     finally:
         timer.cancel()
-        timer.join()
+        timer.join(_LAST_S)

@@ -245,7 +245,8 @@ class _OtherRobots:
         if now < self._due or any(robot.live or robot.estop.has_capabilities for robot in self._sender.robots.values()):
             return
         if self._heartbeats is None:
-            self._heartbeats = self._opened.enter_context(_heartbeats(self._target, every=True))
+            with suppress(PebbleError):  # the config is gone
+                self._heartbeats = self._opened.enter_context(_heartbeats(self._target, every=True))
             self._due = float("inf") if self._heartbeats is None else now + _OTHERS_S
             return
         self._due = float("inf")

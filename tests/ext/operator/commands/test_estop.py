@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -192,6 +192,23 @@ def test_a_stop_is_repeated_until_it_is_confirmed_although_nothing_can_be_printe
         _, err = process.communicate(timeout=WAIT_S)
     assert (process.returncode, err) == (0, "")
     assert robot.latched
+
+
+def test_a_terminal_that_stands_still_holds_no_stop_up(robot_on: Make, broker: Broker) -> None:
+    robot = robot_on("serial")
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+    with suppress(BlockingIOError):
+        while os.write(writing, b"x" * 4096):
+            pass
+    os.set_blocking(writing, True)
+    with (
+        os.fdopen(reading),
+        os.fdopen(writing, "w") as unread,
+        TcpProxy(broker.port, delay_s=0.3) as proxy,
+        running("estop", robot.id, f"--url=mqtt://127.0.0.1:{proxy.port}", stderr=unread),
+    ):
+        assert until(lambda: robot.latched)
 
 
 def test_a_slow_network_does_not_delay_repetitions(robot_on: Make, broker: Broker) -> None:
@@ -531,7 +548,7 @@ def test_a_stopped_robot_is_not_driven_unless_forced(run: Run, robot_on: Make, u
     assert f"pebble estop reset {robot.id}" in run.err
     assert run("topic", "pub", f"{robot.base}/incoming/drive-values", "{}", url) == 0, "a zero moves nothing"
     assert run("topic", "pub", "lights-solid", "{}", url, f"--robot={robot.id}") == 0
-    assert robot.count("drive-values") == 2
+    assert until(lambda: robot.count("drive-values") == 2)
     assert run(*drive, "--force") == 0
     assert until(lambda: robot.count("drive-values") == 3)
 
