@@ -16,7 +16,6 @@ class Uptime(Service):
     """The service: one process, one thread, no lock, and no word of MQTT or Zenoh."""
 
     name = "uptime"
-    publishes = (UPTIME,)
 
     @every(1.0)
     def tell(self) -> None:

@@ -190,8 +190,8 @@ def _declared(module: str) -> Extension | None:
     try:
         extension: Extension = import_module(module).EXTENSION
     except ModuleNotFoundError as error:
-        is_ours = error.name is not None and f"{module}.".startswith(f"{error.name}.")
-        if not is_ours:  # the module is there, and imports something that is not
+        is_missing = error.name is not None and f"{module}.".startswith(f"{error.name}.")  # it, or its package
+        if not is_missing:  # it is there, and imports something that is not
             raise
         return None
     return extension
@@ -437,7 +437,8 @@ def _of_file(path: Path) -> Extension:
     if not path.is_file():
         raise PebbleError(f"there is no file {path}")
     is_root = hasattr(os, "getuid") and os.getuid() == 0
-    if is_root and (uid := path.stat().st_uid or owner_of(path, nameless=False).uid):
+    uid = (path.stat().st_uid or owner_of(path, nameless=False).uid) if is_root else 0  # who can change it; 0: root
+    if uid:
         why = "and root runs no code of other users: chown root it, in a folder of root's"
         raise PebbleError(f"{path} belongs to user {uid}, {why}")
     name = path.stem

@@ -37,7 +37,7 @@ def owner_of(folder: Path, *, nameless: bool = True, there: bool = False) -> Own
         except OSError as error:  # it is missing, or not to be seen by this user
             if there:
                 raise PebbleError(f"{place}: {error.strerror}") from None
-            break
+            break  # then the owner of the folder above decides
         uid = status.st_uid
         if uid == root or not (nameless or _has_name(uid)):  # root, or a user who does not count
             uid = 0

@@ -53,10 +53,11 @@ _RUN = f"PEBBLE_TEST_RUN={secrets.token_hex(8)}"
 os.environ.update([_RUN.split("=")])
 _ENDING_S = 5.0  # for processes that are about to end
 
-#: Folders of tests that check no times.
+#: Folders and modules of tests that check no times.
 _COMPUTING = (
-    *("config", "contract", "ext/media", "motion", "ext/scripts/perception", "ext/page/modules"),
-    *("ext/recordings/exports", "ext/recordings/files", "ext/recordings/seek", "ext/recordings/traffic"),
+    *("commands/", "config/", "contract/", "core/test_extensions", "ext/checks/test_check.", "ext/install/setup/"),
+    *("ext/media/", "ext/page/modules/", "ext/recordings/exports/", "ext/recordings/files/", "ext/recordings/seek/"),
+    *("ext/recordings/test_unread", "ext/recordings/traffic/", "ext/scripts/perception/", "motion/"),
 )
 #: Modules that take longest begin first: begun last, one of them would delay the end of the run.
 _LONG = (
@@ -69,6 +70,7 @@ _LONG = (
     *(
         "ext/operator/commands/test_estop.py",
         "ext/page/test_drive_command.py",
+        "transports/test_contract.py",
         "transports/test_mqtt.py",
         "ext/recordings/recorder",
     ),
@@ -97,7 +99,7 @@ def brokers(tmp_path: Path) -> Iterator[tuple[Broker, Broker]]:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for row in rows.fewer(items):
         row.add_marker(pytest.mark.thorough)
-    computing = tuple(f"{Path(__file__).parent / folder}/" for folder in _COMPUTING)
+    computing = tuple(f"{Path(__file__).parent}/{place}" for place in _COMPUTING)
     for item in items:
         if str(item.path).startswith(computing):
             item.add_marker(pytest.mark.computing)

@@ -85,7 +85,7 @@ def mutants(file: str, text: bytes) -> Iterator[Mutant]:
             record = {"name": f"{name}:{numbers[name]}", "file": file, "line": part.lineno, "change": change}
             reached_by = {(file, line) for line in (statement_line, *range(part.lineno, part.end_lineno + 1))}
             yield record, reached_by, text[:start] + replacement.encode() + text[end:]
-        # Annotations and decorators are not mutated, nor what is inside a call that logs or an f-string.
+        # Not walked, so not mutated: annotations and decorators, taken out here, and what a log call or f-string holds.
         vars(node).update(annotation=None, returns=None, decorator_list=[])
         if not is_log and not isinstance(node, ast.JoinedStr):
             for child in ast.iter_child_nodes(node):
@@ -96,20 +96,20 @@ def mutants(file: str, text: bytes) -> Iterator[Mutant]:
 
 def script_mutants(file: str, text: bytes) -> Iterator[Mutant]:
     """Yield the mutants of a page module, named like those of :func:`mutants`."""
-    words, function = text.decode(), "<module>"
+    script, function = text.decode(), "<module>"
     numbers: Counter[str] = Counter()
-    for match in SCRIPT.finditer(words):
+    for match in SCRIPT.finditer(script):
         operator, old = match.lastgroup, match.group()
-        if operator in ("function", "method"):
+        if operator in ("function", "method"):  # no operator: the mutants that follow are in it
             function = match.group(operator)
-        elif operator is not None:
+        elif operator is not None:  # None: a comment or a string
             stripped = old.strip()
-            new = old.replace(stripped, SCRIPT_WORDS.get(stripped, f"({stripped} + 1)"))
-            name, line = f"{file}:{function}:{operator}", words.count("\n", 0, match.start()) + 1
+            new = old.replace(stripped, SCRIPT_WORDS.get(stripped, f"({stripped} + 1)"))  # + 1: a number
+            name, line = f"{file}:{function}:{operator}", script.count("\n", 0, match.start()) + 1
             numbers[name] += 1
             change = f"{stripped} -> {new.strip()}"
             record = {"name": f"{name}:{numbers[name]}", "file": file, "line": line, "change": change}
-            yield record, {(file, line)}, (words[: match.start()] + new + words[match.end() :]).encode()
+            yield record, {(file, line)}, (script[: match.start()] + new + script[match.end() :]).encode()
 
 
 def replacements(node: Any) -> Iterator[tuple[str, Any, ast.AST]]:
@@ -175,7 +175,7 @@ def run_and_exit(work: Callable[[], object]) -> NoReturn:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         for descriptor in range(3):
             os.dup2(os.open(os.devnull, os.O_RDWR), descriptor)
-        os._exit(not work())
+        os._exit(not work())  # 0 if it returned what is true
     finally:
         os._exit(1)
 

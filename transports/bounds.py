@@ -42,7 +42,7 @@ class BoundedTable(MutableMapping[str, V]):
     """A table of values by topic, in the order in which they were set. The oldest are forgotten to make room.
 
     A value that is too large for the table is not stored, and removes the older value of its topic. Several threads may
-    change the table.
+    change the table. ``size``: the most bytes, of topics and of values, as ``size_of`` counts those.
     """
 
     def __init__(self, topics: int, size: int, size_of: Callable[[V], int]) -> None:

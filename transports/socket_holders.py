@@ -44,10 +44,10 @@ def port_holder(port: int) -> str:
     for name in ("tcp", "tcp6"):
         with suppress(OSError):
             for line in Path("/proc/net", name).read_text(encoding="ascii").splitlines()[1:]:
-                fields = line.split()
+                fields = line.split()  # [1] the own address, [3] the state, [7] the user, [9] the inode
                 if fields[3] == _LISTENS and fields[1].endswith(f":{port:04X}"):
                     users[fields[9]] = fields[7]
-    for process, held in _processes_with(users):  # the first one is enough
+    for process, held in _processes_with(users):  # only the first one is shown
         return f" (by process {process.name} of user {users[held.pop()]}: {_command_of(int(process.name))})"
     if users:
         return f" (by a process of user {users.popitem()[1]}: sudo ss -ltnp 'sport = :{port}')"

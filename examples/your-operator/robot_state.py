@@ -19,7 +19,7 @@ class RobotState:
         self.controls = {}  # who has control, by the same
         self.is_offline = True
         self.heartbeat_at = -math.inf
-        self.shown_holder = ""
+        self.shown_holder = ""  # who has control, as it was printed last
 
     def disconnect(self):
         self.is_offline = True

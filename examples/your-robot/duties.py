@@ -60,10 +60,10 @@ class Robot:
             account, _, metric = metric[len("by/") :].partition("/")
         command = command_of(payload)
         holder = self.control.holder
-        if metric == "estop" and payload:
+        if metric == "estop" and payload:  # a stop needs no account
             self.halt()
             self.stop.press(command or {}, account, self.epoch_ms())
-        elif metric == "drive-values" and command is not None:
+        elif metric == "drive-values" and command is not None:  # nor does a zero: drive() decides
             self.drive(command, account)
         elif command is None or (self.named and not account):
             return

@@ -95,7 +95,7 @@ class Mqtt:
             self.received_at = time.ticks_ms()
         if time.ticks_diff(time.ticks_ms(), self.received_at) > 1000 * KEEPALIVE_S:
             raise OSError("the broker is silent")
-        # After 0.4 of it, in ms: two pings are sent before silence ends the connection.
+        # After 0.4 * KEEPALIVE_S, here in ms: two pings are sent before silence ends the connection.
         if time.ticks_diff(time.ticks_ms(), self.pinged_at) > 400 * KEEPALIVE_S:
             self.pinged_at = time.ticks_ms()
             self.send(PINGREQ, b"")

@@ -36,9 +36,9 @@ class Arbiter:
         self._newest = 0  # the newest run received; all before it are barred
         self._starting = True  # scripts are refused for HOLD_MS, see there
         self._started = now
-        self._held = False  # by a person
+        self._held = False  # scripts wait: a person commanded less than HOLD_MS ago
         self._held_from = now
-        self._resumes = True  # scripts go on after HOLD_MS: the person's last command was a zero, and not final
+        self._resumes = True  # scripts go on after that: the person's last command was a zero, not final (see _take)
         self._scripted = False  # the newest admitted command is a script's, and within its deadline
         self._script_from = now
         self._script_ms = 0
@@ -53,26 +53,26 @@ class Arbiter:
         """
         self.tick(now)
         lease = self.lease
-        local = by is None
+        local = by is None  # a program of the robot
         if by and run != PERSON and not lease.holds(key, by):  # a script elsewhere: its zero counts as a person's
             if moves:
                 return REFUSED
             run = PERSON
         if lease.refuses(moves, run != PERSON or local, key, "" if local else by, now):  # scripts here need no key
             return REFUSED
-        ours = run != PERSON or not lease.key or lease.holds(key, by)  # no other has control: a zero may end a latch
+        ours = run != PERSON or not lease.key or lease.holds(key, by)  # no other client has control
         if newer(run, self.barred) and run != self._newest:  # it has begun, even if this command is refused
             self._newest = run
             self.bar(run - 1 or LAST_RUN)
         if self.latch.latched:
             self.bar(run)
-        # after a reset the latch waits for a zero: not that of a client without control
+        # the zero for which the latch waits after a reset is not that of a client without control
         if (moves or ours) and self.latch.refuses(moves, run != PERSON, now):
             return REFUSED
         limit = self._watchdog_ms if valid_ms < 0 or valid_ms > self._watchdog_ms else int(valid_ms)
         if run == PERSON:
             self._take(moves, valid_ms == 0 or not ours, now)  # final: it is valid for 0 ms, or another has control
-        # people first; and not before scripts may run, nor of a run that is barred
+        # a script is refused while a person holds the wheels, after the start, and if its run is barred
         elif self._held or self._starting or (run > 0 and not newer(run, self.barred)):
             return REFUSED
         else:
@@ -106,8 +106,8 @@ class Arbiter:
     def _take(self, moves: bool, final: bool, now: int) -> None:
         """Handle a person's command: scripts wait, or end. ``final``: a zero ends them in any case.
 
-        A zero that is not ``final`` ends a script only if the script was driving until now. A script that waits already
-        after an earlier command of the person goes on HOLD_MS after the zero, which ends only the person's driving.
+        A zero that is not ``final`` ends a script only if the script was driving until now. If the person was driving,
+        the script waits already: the zero ends the person's driving, and the script goes on HOLD_MS later.
         """
         if not moves and (final or self._scripted):
             self.bar(self._newest)

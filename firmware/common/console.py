@@ -75,7 +75,7 @@ class Port:
                 count += 1
             if count:
                 sys.stdout.write(out.ring, out.first, count)  # type: ignore[call-overload]  # (buffer, offset, length)
-            count += count < most  # the CR itself, if there is one, is left out
+            count += count < most  # and 1 if a CR ended the loop: it is left out
             out.first = (out.first + count) % size
             out.used -= count
             now = time.ticks_ms()

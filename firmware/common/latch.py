@@ -75,7 +75,7 @@ class Latch:
         senders = self.client
         senders.insert(0, sender)
         self.recent = [name] + self.recent  # a new list: states that were returned have the old one
-        if len(senders) > self.names:  # the greatest goes: from before the start, of the busiest sender, the oldest
+        if len(senders) > self.names:  # one from before the start goes first, then of the busiest sender the oldest
             place = max([(other is None, senders.count(other), at) for at, other in enumerate(senders)])[2]
             del self.recent[place], senders[place]
         self.latched = True

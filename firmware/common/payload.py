@@ -80,7 +80,7 @@ def _run(body: dict, stops: bool) -> int:
     if run is not None and not (type(run) is int and 1 <= run <= LAST_RUN):
         run = UNKNOWN_RUN
     if not stops and (run == UNKNOWN_RUN or not (source is None or isinstance(source, str))):
-        raise ValueError
+        raise ValueError  # a wrong run, or a wrong source
     if source != "autonomy":  # any other source is a person
         return PERSON
     if run is None:
@@ -121,7 +121,7 @@ def _number(text: str) -> float:
     """Return the number in ``text``; 0 if Linux robots see none: a board's float() also accepts 1_0, "." and "e5"."""
     if "nan" in text or "inf" in text:  # refused, as `_axis` refuses them as numbers
         raise ValueError
-    if text.strip("0123456789+-.e") or not text.split("e")[0].strip("+-."):
+    if text.strip("0123456789+-.e") or not text.split("e")[0].strip("+-."):  # another letter, or no digit before e
         return 0.0
     try:
         return float(text)

@@ -39,7 +39,7 @@ class Port:
         out = self._out
         size = len(out.ring)
         while out.used:
-            for _ in self._writable.ipoll(0):
+            for _ in self._writable.ipoll(0):  # yields once if the host takes a byte
                 break
             else:  # the host takes nothing now
                 return

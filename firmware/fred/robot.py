@@ -62,10 +62,10 @@ class Robot:
     """The board. Call ``step`` often; every turn checks the failsafe first."""
 
     def __init__(self) -> None:
-        # before anything else: motors off; their PWM is made last, see pins.py
+        # before anything else: motors off; PWM is made in the order of pins.py: red, green, blue, last the motors'
         self._left, self._right = Motor(pins.LEFT, pins.PWM_HZ), Motor(pins.RIGHT, pins.PWM_HZ)
         red, green, blue = [PWM(Pin(pin, Pin.OUT, value=0), freq=pins.PWM_HZ, duty_u16=0) for pin in reversed(pins.LED)]
-        self._led = (blue, green, red)
+        self._led = (blue, green, red)  # as in pins.LED
         self._now = now = time.ticks_ms()
         self.deadman = DeadMan(_FAILSAFE_MS)
         self.gears = Gears()

@@ -43,7 +43,7 @@ class Imu:
         self._device, self._log = device, log
         self._data = bytearray(14)
         self._skip = 0  # samples after power on that were skipped
-        self._first = self._sums = self.bias  # for _learn, which makes both lists; until then any list saves 100 bytes
+        self._first = self._sums = self.bias  # `_learn` makes both lists; an existing one saves 100 bytes until then
         self._working = False
         self._in_a_row = 0  # failures
         self._retry_at: int | None = None

@@ -17,6 +17,7 @@ def answer(data: bytes, asked: bytes, skip: int = 0) -> str | None:
 
     Of several addresses it returns the first if ``skip`` is 0. Else it sorts them, and ``skip`` modulo their number is
     the index. Servers change the order of their answers: so a caller can try each only by its place in a sorted list.
+    The case of the name does not matter; in ``asked`` it is lower, see `query`.
     """
     at = len(asked)
     if len(data) < at or data[:2] != asked[:2] or data[12:at].lower() != asked[12:]:
@@ -32,7 +33,7 @@ def answer(data: bytes, asked: bytes, skip: int = 0) -> str | None:
         if at + 10 > len(data):
             break
         length = data[at + 8] << 8 | data[at + 9]
-        # type address, class internet but for mDNS's own bit in it
+        # type address, class internet; mDNS may set the highest bit of the class
         if data[at : at + 2] == b"\0\1" and data[at + 2] & 127 == 0 and data[at + 3] == 1 and length == 4:
             address = data[at + 10 : at + 14]
             if len(address) == 4 and address not in addresses:

@@ -49,16 +49,16 @@ class NetworkRobot:
         self._wifi = Wifi(get(settings, "wifi", "ssid"), get(settings, "wifi", "password", ""))
         self._clock = Clock(settings.get("ntp", "pool.ntp.org"), now)
         names = None
-        if ("open", "login", "named").index(get(settings, "security", "level", "open")) == 2:  # named; or ValueError
+        if ("open", "login", "named").index(get(settings, "security", "level", "open")) == 2:  # any other: ValueError
             from common import names  # type: ignore[assignment]
         words = "drive", "free", "refuse"  # numbered as in `Lease`; without a setting refuse at level named, else free
         strangers = words.index(get(settings, "security", "strangers", words[2 if names else 1]))
         topics = b"estop", b"drive-values", b"control", b"control/take", b"estop-reset"
         if hasattr(body, "groups"):
             topics += (b"group",)
-        plain = len(topics)  # so many are subscribed to without an account
+        plain = len(topics)  # how many of them, from the first on, are subscribed to without an account
         if names:  # clients without one may stop, and send zeros; those that may drive may also have control
-            plain = _DRIVE + 1 if strangers == 2 else _CONTROL + 1  # 2: they are refused
+            plain = _DRIVE + 1 if strangers == 2 else _CONTROL + 1  # 2: strangers may not drive
         self.session = Session(settings, root, topics, plain, names, wrap, self._take)
         self.stops = EmergencyStop(now, _DRIVE_LIMIT_MS, strangers, names)
         self.deadman = DeadMan(_DRIVE_LIMIT_MS)
@@ -137,7 +137,7 @@ class NetworkRobot:
             # A stop counts without an account, too: its topic without one is among the first.
             self.stops.stoppable = results[_ESTOP] <= 127 and granted[_RESET] <= 127
             self.stops.controllable = granted[_CONTROL] <= 127
-            # The topic of groups is the last one. A body that takes none has no ``groups``, whatever is last then.
+            # The last one is the topic of groups, unless the body takes none: then it has no ``groups`` either.
             self.groups = getattr(self.body, "groups", b"") if granted[-1] <= 127 else b""
             self._heartbeats = 0
             self._due = now
@@ -161,7 +161,7 @@ class NetworkRobot:
                 stops.request(raw, sender, topic == _TAKE, now)
         elif not stops.stoppable:  # without a way to reset it, a stop is only a zero
             if topic == _ESTOP:
-                stops.arbiter.judge(False, PERSON, 0, now)
+                stops.arbiter.judge(False, PERSON, 0, now)  # as a zero of a person
                 self._halt()
         elif topic == _ESTOP:
             if stops.stop(raw, by, self._clock.read(now)):
@@ -196,7 +196,7 @@ class NetworkRobot:
         stops = self.stops
         if stops.due and self._heartbeats and session.publish(stops.due, stops.state(), 1):
             stops.published(now)
-            return True  # so the rest has room in the next turn
+            return True  # written at once it leaves room for the rest, in the next turn
         if diff(now, self._due) < 0:
             return False
         if not self._heartbeats:
@@ -211,7 +211,7 @@ class NetworkRobot:
             if diff(now, self._due) >= 0:  # missed heartbeats are skipped
                 self._due = add(now, _HEARTBEAT_MS)
             session.publish(b"online", b'{"t": %d, "online": true}' % self._clock.read(now), 1)
-            if self._heartbeats % _REPORT_EVERY == 1:
+            if self._heartbeats % _REPORT_EVERY == 1:  # with the first heartbeat, then with every few
                 self.body.report(session.publish)
         self._heartbeats += 1
         return False

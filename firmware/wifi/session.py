@@ -157,7 +157,7 @@ class Session:
         client = self.client
         if self._paused and self.connection.state == "online" and diff(now, self._since) >= _CALM_MS:
             self._paused = False  # the flood is over
-            client.subscribe(len(client.topics))
+            client.subscribe(len(client.topics))  # to all: during the flood only stops were
         if not urgent and diff(now, self._wrote) < _PACE_MS and client.waiting < len(client.out) // 2:
             return
         if client.waiting and not self._asked and self.connection.state == "online":

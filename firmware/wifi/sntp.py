@@ -25,7 +25,7 @@ def epoch_ms(packet: bytes, nonce: bytes) -> int | None:
     seconds, fraction = struct.unpack_from(">II", packet, 40)
     if not seconds:
         return None
-    if not seconds >> 31:
+    if not seconds >> 31:  # so few are of the era that begins in 2036
         seconds += _ERA_S
     return (seconds - _TO_UNIX_S) * 1000 + (fraction * 1000 >> 32)
 

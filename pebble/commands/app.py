@@ -51,9 +51,9 @@ def commands(words: Sequence[str] = ()) -> dict[str, Offered]:
 def run(arguments: list[str]) -> int:
     """Run a command line; return the exit code, 2 if it is wrong. Raises PebbleError."""
     for extension in ours():
-        for former, now in extension.former.items():
+        for former, now in extension.former.items():  # a command of earlier versions, and its successor
             if arguments[: len(former.split())] == former.split():
-                command = now.partition(" --")[0]
+                command = now.partition(" --")[0]  # without options, which its help explains
                 sys.stderr.write(f'pebble: "{former}" is now "{now}": pebble {command} --help\n')
                 return 2
     with _thread_errors_on_stderr():
@@ -61,11 +61,11 @@ def run(arguments: list[str]) -> int:
 
 
 def application(words: Sequence[str] = ()) -> Any:
-    """Return the command ``pebble``, which parses a command line; ``words``: as for :func:`commands`."""
+    """Return the command ``pebble``, which parses a command line; ``words``: its beginning, if known."""
     app = typer.Typer(cls=_Pebble, rich_markup_mode=None)
     app.callback()(_options)
     command = typer.main.get_command(app)
-    assert isinstance(command, _Pebble)  # noqa: S101 - cls
+    assert isinstance(command, _Pebble)  # noqa: S101 - by ``cls`` above
     command.offer(commands(words))
     return command
 
@@ -152,7 +152,7 @@ def _run(arguments: list[str]) -> int:
         code = application(arguments).main(arguments, prog_name="pebble", standalone_mode=False)
     except typer.TyperException as error:  # of a wrong command line
         context, message = getattr(error, "ctx", None), error.format_message().rstrip(".")
-        if context is not None and message == "Missing command":
+        if context is not None and message == "Missing command":  # `pebble fleet` alone asks what there is
             typer.echo(context.get_help())
             return 0
         from pebble.config.secret_text import without_secrets  # of use to errors only
@@ -166,7 +166,7 @@ def _run(arguments: list[str]) -> int:
         return 2
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
-        if package in ("", "pebble"):
+        if package in ("", "pebble"):  # a mistake of ours, with its traceback
             raise
         install = 'pip install "pebble-robot[all]"'
         raise PebbleError(f"{arguments[0]} needs the package {package}, which is not installed: {install}") from None

@@ -159,7 +159,7 @@ def _config(
     file_class, config_class, rules = _classes(installed)
     reader = Reader(folder, env, rules, notes, file=path, other_forms=True)
     merged = with_instances(written)
-    ignored_keys = extensions.keys_of_missing(installed)  # of ours that do not count here: no class has these keys
+    ignored_keys = extensions.keys_of_missing(installed)  # of ours that are not in ``installed``: no class has them
     if core_only:
         ignored_keys += [key for extension in available for key in extension.sections]
     root = reader.section(file_class, without(merged, ignored_keys))
@@ -167,7 +167,7 @@ def _config(
     if path is not None and holds_secret(written):
         warn_if_readable(notes, (), path, "it, and there is a password in it")
     if notes.problems:
-        # Missing extensions come first: unknown sections may be theirs.
+        # Missing extensions come first, even those that are only warnings: unknown sections may be theirs. Each once.
         raise ConfigError(list(dict.fromkeys(map(str, (*about_missing, *notes.problems)))))
     identity = Identity(root.robot.system, root.robot.type, root.robot.id)
     config: Config = config_class(
@@ -199,7 +199,7 @@ def _motor_owners(config: Config) -> tuple[str, ...]:
 
 
 def _extensions(written: Any, folder: Path) -> tuple[tuple[Extension, ...], tuple[Missing, ...]]:
-    """Return the extensions of this config, ours and those that the file lists, and the ones that are missing here.
+    """Return the extensions of this config, ours and those that the file lists; and those of either that are missing.
 
     Also registers the serial protocols of those that the file lists.
     """
@@ -208,7 +208,7 @@ def _extensions(written: Any, folder: Path) -> tuple[tuple[Extension, ...], tupl
     drives = {name: extensions.value_at(entry, "drives") is True for name, entry in entries.items()}
     named, missing = extensions.named(drives, folder, Section)
     installed = (*extensions.ours(), *named)
-    # what the core has, in the form of an extension: no other may add the same
+    # What the core has is declared as an extension too, so that no other may add a section or protocol of its names.
     taken = [*dir(Config), *(f"services.{name}" for name in dir(Services))]  # keys, and names of methods
     protocols = {name: SERIAL_PROTOCOLS[name] for name in OF_CORE}
     core = Extension(name="core", package="Pebble", sections=dict.fromkeys(taken, ""), protocols=protocols)

@@ -67,7 +67,7 @@ def endpoint(text: str) -> str:
     if protocol in _ZENOH:
         address = re.split("[?#]", place, maxsplit=1)[0]  # what follows are Zenoh's own settings of it
         try:
-            has_port = _only_place(re.sub(":0$", ":1", address)).port is not None  # it refuses 0, any free one
+            has_port = _only_place(re.sub(":0$", ":1", address)).port is not None  # `split` refuses 0, any free port
         except HostError:
             has_port = False
         if not has_port:

@@ -31,7 +31,7 @@ def reading_of(annotation: Any, kind: Any, metas: list[Meta], raw: Any, default:
     starts again at 0), ``unlike`` (the value for any other ``raw``).
     """
     extra = {key: value for meta in metas for key, value in (meta.extra or {}).items()}
-    number = _number(raw)
+    number, wants_number = _number(raw), kind in (int, float)
     for form in _forms(kind, extra, raw, number):
         try:
             value = msgspec.convert(form, annotation, strict=False)
@@ -41,13 +41,13 @@ def reading_of(annotation: Any, kind: Any, metas: list[Meta], raw: Any, default:
             return Reading(value, differs=False)  # its meaning is the same
     if "unlike" in extra:
         return Reading(extra["unlike"])
-    if raw and isinstance(raw, str) and kind not in (int, float):  # a text that is no form of a value is a mistake
+    if raw and isinstance(raw, str) and not wants_number:  # a text that is no form of a value is a mistake
         return None
-    is_empty = not raw or (raw is True and kind not in (int, float))  # as a number a mere true is a mistake
+    is_empty = not raw or (raw is True and not wants_number)  # as a number a mere true is a mistake
     means_default = number == 0 or (is_empty and "exact" not in extra)  # with "exact" only a 0 does
     if means_default and default is not NODEFAULT:
         return Reading(default)
-    if kind not in (int, float) or number is None or "exact" in extra:
+    if not wants_number or number is None or "exact" in extra:
         return None
     for meta in metas:
         if meta.gt is not None and number <= meta.gt:  # above such a limit no number is the nearest

@@ -54,7 +54,7 @@ def plain(raw: Any, notes: problems.Notes, path: problems.Path = ()) -> Any:
     if len(path) > _DEEPEST:
         notes.problem(path[:2], f"is nested more than {_DEEPEST} levels deep")
         return None
-    if isinstance(raw, dict):
+    if isinstance(raw, dict):  # made by a program, not by `decode`
         raw = Pairs(raw.items())
     if isinstance(raw, Pairs):
         return _object(raw, notes, path)
@@ -63,7 +63,7 @@ def plain(raw: Any, notes: problems.Notes, path: problems.Path = ()) -> Any:
     if isinstance(raw, float) and not math.isfinite(raw):
         notes.problem(path, f"must be a number, not {raw}")
         return None
-    if isinstance(raw, str) and (flaw := hidden(raw, words=_is_words(path))):
+    if isinstance(raw, str) and (flaw := hidden(raw, words=_is_words(path))):  # not shown, or a blank at an end
         notes.problem(path, flaw)
         return ""
     return raw
@@ -73,7 +73,7 @@ def _object(pairs: Pairs, notes: problems.Notes, path: problems.Path) -> dict[st
     data: dict[str, Any] = {}
     for key, value in pairs:
         if key.startswith("//") or (key.startswith("_") and not (path and path[-1] in _OF_NAMES)):
-            continue  # a comment, unless _ begins a name that the owner chose
+            continue  # a comment; but in _OF_NAMES the owner chooses the names, and _ may begin one
         if flaw := hidden(key):
             notes.problem(path, f'has a key "{shown(key)}" that {flaw}')
             continue
@@ -95,7 +95,7 @@ def deep_merge(under: Any, over: Any) -> Any:
     if not isinstance(under, dict) or not isinstance(over, dict):
         return over
     merged = {key: deep_merge(under.get(key), value) for key, value in over.items()}
-    return merged | {key: value for key, value in under.items() if key not in over}  # last: problems are in file order
+    return merged | {key: value for key, value in under.items() if key not in over}  # last: problems keep over's order
 
 
 def with_instances(raw: Any) -> Any:

@@ -90,9 +90,9 @@ class Reader:
         for retired, replacement in kind.all_retired().items():
             if key == retired or (retired.endswith("*") and key.startswith(retired[:-1])):
                 self.notes.retired.append(problems.Note(path, replacement))
-                return key
+                return key  # it has no present name: nothing reads it
         if key in kind.refused:
-            self.notes.problem(path[:-1], f"{key} {kind.refused[key]}")
+            self.notes.problem(path[:-1], f"{key} {kind.refused[key]}")  # of its section: the text has the key
         elif name not in known and kind.holds_others and not problems.near(key, known, _SAME_SECTION):
             self.notes.warning(path, "is not read: nothing that is installed has a section of this name")
         elif name not in known:
@@ -129,10 +129,10 @@ class Reader:
             return self._scalar(annotation, raw, path, default)
         return self._replacement(annotation, raw, path, default)
 
-    def _scalar(self, annotation: Any, raw: Any, path: problems.Path, default: Any) -> Any:
+    def _scalar(self, annotation: Any, raw: Any, path: problems.Path, default: Any) -> Any:  # text, number or bool
         kind, metas = unwrap(annotation)
         choices = _choices(kind, metas)
-        if choices and isinstance(raw, str):
+        if choices and isinstance(raw, str):  # upper and lower case count as one
             raw = next((choice for choice in choices if str(choice).lower() == raw.lower()), raw)
         try:
             value = msgspec.convert(raw, annotation)
@@ -149,7 +149,7 @@ class Reader:
         tells_nothing = shown == "text" and (get_origin(kind) is Literal or kind in (str, Path))
         must_be = f"must be {expected(kind, metas)}" + ("" if tells_nothing else f", not {shown}")
         reading = reading_of(annotation, kind, metas, raw, default) if self._other_forms else None
-        if reading is not None and reading.differs:
+        if reading is not None and reading.differs:  # another value, with a warning
             is_set = bool(reading.value) or reading.value == 0  # 0 and false are values
             used = f"{msgspec.json.encode(reading.value).decode()} is used" if is_set else "it counts as not set"
             self.notes.warning(path, f"{must_be}; {used}")
@@ -231,9 +231,9 @@ def expected(kind: Any, metas: list[Meta]) -> str:
 
 
 def _limits(metas: list[Meta]) -> Iterator[str]:
-    bound: dict[str, float] = {}
-    for meta in metas:
-        bound |= {name: limit for name in ("ge", "gt", "le") if (limit := getattr(meta, name)) is not None}
+    """Yield a number's limits in words, to follow "a number"."""
+    limits = [(name, getattr(meta, name)) for meta in metas for name in ("ge", "gt", "le")]
+    bound = {name: limit for name, limit in limits if limit is not None}  # of several ``metas`` the last counts
     if "ge" in bound and "le" in bound:
         yield f"from {bound['ge']} to {bound['le']}"
     elif "gt" in bound:

@@ -6,12 +6,23 @@ HIDDEN = "***"
 _NAMES = "pass|secret|token|credential|(?:api|access|private|auth).?key"
 _KEY = re.compile(_NAMES, re.IGNORECASE).search
 _NAME = rf"[\w-]{{0,40}}(?:{_NAMES}|pwd)[\w-]{{0,40}}"
-_PAIR = re.compile(rf"(\b(?:{_NAME}|[\w-]{{0,40}}\bsig(?:nature)?)=)[^&\s]+", re.IGNORECASE)  # of a query or an option
+_END = r"(?<![_-]file)(?<![_-]env)"  # of a name; what is in a file or a variable stays there
+_VALUE = r"""(?:(?<=")[^"\n]+|(?<=')[^'\n]+|(?<!["'])[^&\s]+)"""  # in quotes it may have blanks
+_NEXT = r"""(?:["'],\s*|[= \t][ \t]*)\\?["']?"""  # from an option to its value, on a command line or in a list
+#: A pair of a query, an option or a variable.
+_PAIR = re.compile(rf"""(\b(?:{_NAME}|[\w-]{{0,40}}\bsig(?:nature)?)=\\?["']?){_VALUE}""", re.IGNORECASE)
+#: An option whose name says it, the login of `curl -u`, and options of programs that are often in scripts.
+_OPTION = re.compile(
+    rf"""((?<![\w-])(?!--no-)--?(?i:{_NAME}){_END}{_NEXT}(?!-)"""
+    rf"""|(?<![\w-])(?:-u|--(?:proxy-)?user)(?:{_NEXT})?(?!\d+:\d+\b)[^\s:"'/=]{{1,64}}:(?!//)"""
+    rf"""|\bmosquitto_[^\n]{{1,400}}?[\s"']-P{_NEXT}"""
+    rf"""|\b(?:sshpass|mysql|docker login)\b[^\n]{{0,400}}?[\s"']-p(?:{_NEXT})?){_VALUE}"""
+)
 _HEADER = re.compile(
-    r"""(\b(?:authorization|cookie|x-[\w-]{0,40}(?:key|auth|token|secret))\\?["']?\s*:\s*\\?["']?)[^\s\\"'][^\\"'\n]*""",
+    r"""(\b(?:authorization|cookie|x-[\w-]{0,40}(?:key|auth|token|secret))\\?["']?\s*:\s*\\?["']?)"""
+    r"""[^\s\\"'](?:[^\\"'\n]|(?<==)\\?"[^"\n]*")*""",  # a Digest has values in quotes
     re.IGNORECASE,
 )
-_END = r"(?<!_file)(?<!_env)"  # of a name; what is in a file or a variable stays there
 #: A member of an object in JSON, in JSON that is itself a text there, and in Python's writing.
 _MEMBER = re.compile(
     rf'("{_NAME}{_END}"\s*:\s*")(?:[^"\\]|\\.)+'
@@ -41,9 +52,10 @@ def without_secrets(text: str) -> str:
     """
     if _AT.search(text):
         text = re.sub(r"\S+", _without_login, _LOGIN_WITH_BLANKS.sub(rf"\1{HIDDEN}@", text))
-    text = _PAIR.sub(rf"\1{HIDDEN}", text) if "=" in text else text
-    hidden = rf"\1\2\3\4{HIDDEN}"  # of the four groups one is not empty
-    return _MEMBER.sub(hidden, _HEADER.sub(rf"\1{HIDDEN}", text)) if ":" in text else text
+    text = _PAIR.sub(rf"\1{HIDDEN}", text) if "=" in text else text  # without "=" it finds none: this saves time
+    text = _OPTION.sub(rf"\1{HIDDEN}", text) if "-" in text else text  # the same
+    text = _HEADER.sub(rf"\1{HIDDEN}", text) if ":" in text else text
+    return _MEMBER.sub(rf"\1\2\3\4{HIDDEN}", text) if ":" in text else text  # one of the four groups is not empty
 
 
 def _without_login(match: re.Match[str]) -> str:
@@ -56,9 +68,9 @@ def _without_login(match: re.Match[str]) -> str:
     slashes = _SLASHES.search(word)
     # The first colon with a password after it; the user name before it begins after a sign such as a quote.
     colon = next((colon for colon in _COLON.finditer(word, 0, end) if colon.end() < end), None)
-    if slashes and slashes.end() <= end:
+    if slashes and slashes.end() <= end:  # SCHEME://LOGIN@
         start = slashes.end()
-    elif colon:
+    elif colon:  # NAME:PASSWORD@
         start = max((sign.end() for sign in _BEFORE_USER.finditer(word, 0, colon.start())), default=0)
     else:
         return word

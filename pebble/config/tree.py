@@ -303,16 +303,16 @@ def tree_of(sections: Mapping[str, type[Section]], kind: type[Section] = Root) -
 
     They come by key: ``lamp`` is a section of ``kind``, ``services.lamp`` adds ``lamp`` to its section ``services``.
     """
-    added: list[tuple[str, Any]] = []  # keys with their annotations
+    added: list[tuple[str, Any]] = []  # keys with their annotations: new ones, and those whose section gets more keys
     for key, section in sections.items():
         if "." not in key:
             added.append((key, Annotated[section, doc(section.meaning())]))
-    for key_field in fields(kind):
+    for key_field in fields(kind):  # a section among them may get sections of extensions
         start = f"{key_field.name}."
         inner = {key.removeprefix(start): section for key, section in sections.items() if key.startswith(start)}
         if inner:
             section, *metas = get_args(key_field.type)  # the parts of Annotated[section, *metas]
             added.append((key_field.name, Annotated[tree_of(inner, section), *metas]))
-    with_defaults = [(key, annotation, get_args(annotation)[0]()) for key, annotation in added]  # [0]: the section
+    with_defaults = [(key, annotation, get_args(annotation)[0]()) for key, annotation in added]  # [0]: the class
     namespace = {"__doc__": kind.__doc__, "__module__": kind.__module__}
     return defstruct(kind.__name__, with_defaults, bases=(kind,), namespace=namespace, frozen=True, kw_only=True)

@@ -15,10 +15,10 @@ def hidden(text: str, *, words: bool = False) -> str:
 
     ``words``: a blank, a tab and a new line may stand anywhere.
     """
-    may_hide = not (text.isprintable() and text.isascii())  # else no character of it needs a look
+    may_hide = not (text.isprintable() and text.isascii())  # printable ASCII hides nothing
     for place, char in enumerate(text if may_hide else ""):
         is_allowed = words and char in "\t\n\r"
-        if not is_allowed and _is_hidden(char) and not _joins(text, place):
+        if not is_allowed and _is_hidden(char) and not _joins(text, place):  # joiners may stay: emoji have them
             return f"holds U+{ord(char):04X}, which is not shown: remove it"
     return "" if words or text == text.strip() else "starts or ends with a blank: remove it"
 
@@ -35,17 +35,17 @@ def shown(text: str) -> str:
     """
     if text.isascii() and text.isprintable():
         return text
-    return "".join(_coded(char) if _steers(text, place) else char for place, char in enumerate(text))
+    return "".join(_coded(char) if _needs_code(text, place) else char for place, char in enumerate(text))
 
 
-def _steers(text: str, place: int) -> bool:
-    """True if the character at ``place`` is neither seen nor a blank: it may reorder text, or control a terminal."""
+def _needs_code(text: str, place: int) -> bool:
+    """True if the character at ``place``, invisible and no blank, might reorder text or control a terminal."""
     import unicodedata
 
     char = text[place]
     if char in "\t\n" or not _is_hidden(char) or _joins(text, place):
         return False
-    return unicodedata.category(char) != "Zs"
+    return unicodedata.category(char) != "Zs"  # a blank
 
 
 def _coded(char: str) -> str:

@@ -178,7 +178,7 @@ def _request(channel: Channel, request: Any) -> Any:
 
 
 def _drive(channel: Channel, command: dict[str, Any], remark: Remark) -> dict[str, Any]:
-    """Return the valid fields of a drive command. Raises PayloadError for wrong ones, unless it moves nothing."""
+    """Return a drive command's valid fields. Raises PayloadError if it moves, but one that decides on it is wrong."""
     axes = _numbers(channel, command, remark)
     if not axes:
         keys = ", ".join([_shown(key) for key in command][:_KEYS_SHOWN]) or "nothing"

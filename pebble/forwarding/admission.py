@@ -39,8 +39,8 @@ class Admission:
         return self._refuse_limited(side, subject, message, topic, named) if subject.counted else None
 
     def _refuse_limited(self, side: Side, subject: Subject, message: Message, topic: str, named: bool) -> Drop | None:
-        """Return why one more message of a limited kind may not pass; None if it may. Counts it."""
-        if side is Side.REMOTE and self._is_too_often(subject, message, named):
+        """Return why one more message of a limited kind may not pass; None if it may. It is counted."""
+        if side is Side.REMOTE and self._is_too_often(subject, message, named):  # counts it
             return Drop.TOO_OFTEN
         if subject.kind is not Kind.FLAG or subject.channel is not None:
             return None

@@ -80,7 +80,7 @@ class Cycles:
         self._ways: dict[tuple[Side, str], _Way] = {}  # by the side from which messages come, and their topic
         self._ours: dict[bytes, Side] = {}  # our probes, and the side each was sent to
         self._others: dict[tuple[Side, bytes], bool] = {}  # probes of other bridges that were relayed; an ordered set
-        self._stops: dict[tuple[Side, bytes], float] = {}  # when each was received last, by side and payload
+        self._stops: dict[tuple[Side, bytes], float] = {}  # when each stop passed last, by side and payload
         #: Messages from this side on this topic come back there if they are forwarded.
         self.closed_ways: Final[set[tuple[Side, str]]] = set()
 
@@ -92,7 +92,7 @@ class Cycles:
         topic, payload = message.topic, message.payload
         if subject.is_stop:
             return Finding.CIRCULATES if self._repeats_stop(side, topic, payload) else Finding.PASS
-        is_one_shot, usual = subject.kind.one_shot, _usual_count(subject)
+        is_one_shot, usual = subject.kind.one_shot, _usual_count(subject)  # usual: so many equal ones start no probe
         number = _number_of(payload) if payload[-1:] in _DIGITS else None
         with self._lock:
             if number is not None:
@@ -103,10 +103,10 @@ class Cycles:
                 may_pass = subject.runs or not is_one_shot  # `Publisher.is_echo` recognises them when they return
                 if not may_pass or count > SUSPICIOUS:
                     return Finding.CIRCULATES
-            is_new_storm = count > STORM and not way.closed  # a closed way is known to circulate
+            is_new_storm = count > STORM and not way.closed  # that a closed way circulates is no news
             period = _PERIOD_IN_STORM_S if is_new_storm else PROBE_PERIOD_S
             never_probed = way.probed_at == float("-inf")
-            # Where any topic circulates, all others may as well.
+            # Where any topic circulates, all others may as well: each is probed once.
             is_suspicious = way.closed or count > usual or (never_probed and bool(self.closed_ways))
             can_be_probed = is_one_shot or len(payload) <= _LONGEST
             # Another bridge may have begun since the last probe: so the first suspicious message is probed at once.
@@ -114,7 +114,7 @@ class Cycles:
             return Finding.SUSPECT if is_suspicious and can_be_probed and is_due else Finding.PASS
 
     def _repeats_stop(self, side: Side, topic: str, payload: bytes) -> bool:
-        """True if a stop comes back faster than a sender repeats it. Counts the stop; stops are not probed."""
+        """True if a stop comes faster than a sender repeats it: it circulates. Counts it; notes when one passes."""
         with self._lock:
             now, key = self._clock(), (side, payload)
             often = self._way(side, topic).count(payload, now) > SUSPICIOUS

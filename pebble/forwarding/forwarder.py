@@ -210,7 +210,7 @@ class Forwarder:
         """Forward a message whose sender is checked: the name moves from the topic into the payload."""
         sender = names[message.topic]
         subject, by = sender.subject, sender.account  # by: a Signed, below, adds the person for whom the account acts
-        outcome = self.admit(source, subject, message, sender.topic, by != NO_ACCOUNT)  # notes foreign ones, too
+        outcome = self.admit(source, subject, message, sender.topic, by != NO_ACCOUNT)  # notes foreign retained ones
         if subject is None:
             outcome = sender.foreign  # why the topic means nothing to this robot
         elif isinstance(outcome, Forward):
@@ -219,7 +219,7 @@ class Forwarder:
                     outcome = self.retained.change(subject, signed)  # the topic without a name gets it on both sides
                 case Signed(signed, by):
                     outcome = self.pass_on(source, subject, signed, outcome, sender.account)
-                case Drop.UNNAMED if outcome.retain:  # it may be a retained message of the robot itself
+                case Drop.UNNAMED if outcome.retain:  # perhaps the robot's own, as the remote broker has retained it
                     outcome = self.retained.receive(source, subject, message, outcome, only_old=True)
                 case Drop() as drop:
                     outcome = drop
@@ -316,7 +316,7 @@ class Forwarder:
         """Return an admitted message as it may pass, or why not: it is too late, or a script elsewhere sent it."""
         if subject.kind.one_shot and self._is_late(subject, message, forward, account):
             return Drop.LATE
-        if not forward.unsigned:  # it may have a script's signature
+        if not forward.unsigned:  # here signed commands pass, too
             return message
         return self._without_script(source, message) or Drop.SIGNED
 
@@ -351,7 +351,7 @@ class Forwarder:
             payloads = list(self._pass_stop(source.side, message.payload))
             for payload in payloads:
                 self.publisher.publish(target, subject, Message(message.topic, payload, message.qos), forward)
-            return forward if payloads else Drop.RESET  # all were reset since; or the mirror keeps one owner's copy
+            return forward if payloads else Drop.RESET  # none: it was reset since, or is a copy that a mirror keeps
         if is_event:
             self.publisher.note_return(target, subject, message)
             target.events.send(message)
@@ -369,16 +369,16 @@ class Forwarder:
             case Finding.SUSPECT:  # the probe goes first: it comes back before the message does
                 self.publisher.probe(side, message.topic, message.payload)
                 return None
-            case Finding.RELAY:
+            case Finding.RELAY:  # another bridge's probe
                 relayed = Forward(forward.qos, False, forward.urgent)  # False: not retained
                 self.publisher.publish(self.sides[side.other], subject, message, relayed)
-        return Drop.PROBE  # of RELAY, too: that probe was sent on above
+        return Drop.PROBE  # Finding.PROBE: ours, or forwarded before; after RELAY: published just now
 
     def _hold_event(self, target: SideState, message: Message) -> Drop:
         if self.gate is Gate.SHUT:
             return Drop.CLOSED
         target.events.hold(message)
-        gate = self.sides.gate  # it may have been opened or shut meanwhile, perhaps before this event was there
+        gate = self.sides.gate  # again: who opened or shut it meanwhile may have found the events without this one
         if gate is Gate.OPEN:
             target.events.resume()
         elif gate is Gate.SHUT:

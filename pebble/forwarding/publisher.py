@@ -55,7 +55,7 @@ class Publisher:
     def note_return(self, to: SideState, subject: Subject, message: Message) -> None:
         """Expect ``message``, published to one side, to come back on the other side, if its topic circulates.
 
-        A command that runs something is expected even before its probe has shown whether its topic circulates.
+        One that runs something is expected even before a probe shows that; a drive command does not pass then.
         """
         origin = to.side.other
         if subject.runs or (not subject.kind.one_shot and (origin, message.topic) in self._cycles.closed_ways):

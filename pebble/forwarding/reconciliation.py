@@ -153,9 +153,9 @@ class Reconciliation:
                 self._newer.discard(topic)
                 self._offered.discard(topic)
             elif other_away and len(self._overtaken) < TOPICS:
-                self._overtaken.add(topic)  # the winner's value, when it returns, is older
+                self._overtaken.add(topic)  # what the winner brings when it returns is older
             elif not retained and self._may_come_late(topic) and len(self._newer) < TOPICS:
-                self._newer.add(topic)  # a value of the winner that still comes is older
+                self._newer.add(topic)  # what the winner, which is here, still brings is older
             self._set(topic, payload, side)
         return resolution
 

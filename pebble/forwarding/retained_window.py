@@ -24,8 +24,8 @@ class RetainedWindow:
     def __init__(self, transport: Transport, clock: Callable[[], float]) -> None:
         self._transport, self._clock = transport, clock
         self._subscribed_at = float("inf")
-        self._until = float("inf")  # when messages with the retain flag count as live ones again,
-        self._stops_until = float("inf")  # and when stops do
+        self._until = float("inf")  # when messages with the retain flag count as live ones again
+        self._stops_until = float("inf")  # the same for stops
         self._newest_at = float("-inf")  # of the messages that may be old
 
     @property
@@ -46,12 +46,12 @@ class RetainedWindow:
 
     def note(self) -> None:
         """Note a message with the retain flag. While such messages arrive, a stop may be an old one."""
-        now, until = self._clock(), self._stops_until  # only for stops the end is put off: not _until
+        now, until = self._clock(), self._stops_until  # _until stays: the end is put off for stops alone
         if now >= until:  # the window for stops is over
             return
         self._newest_at = now
         if until < float("inf"):  # the subscription is complete: so each message puts the end off
-            latest = self._subscribed_at + _RETAINED_STOPS_S  # whatever arrives
+            latest = self._subscribed_at + _RETAINED_STOPS_S  # it ends then, whatever still arrives
             self._stops_until = min(max(now + INITIAL_SYNC_S, until), latest)
 
     def is_old_stop(self, message: Message) -> bool:

@@ -120,8 +120,8 @@ def route(rules: Rules, side: Side, subject: Subject | None, message: Message, *
         _qos(subject, message),
         _retain(subject, message),
         urgent=subject.kind in URGENT,
-        unsigned=from_outside and subject.drives,
-        stamped=from_outside and subject.stamped,
+        unsigned=from_outside and subject.drives,  # only programs on the robot may sign as a script
+        stamped=from_outside and subject.stamped,  # its own time stamp, if any, tells its age
     )
 
 

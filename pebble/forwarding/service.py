@@ -137,7 +137,7 @@ class ForwardingService(Service, ABC):
         self.unsubscribe(Side.REMOTE)
         self.forwarder.sides[Side.REMOTE].subscribing()
         receive = partial(self.receive_remote, self.epoch)
-        directions = (INCOMING,) if self.rules.leaves_robot else (INCOMING, OUTGOING)
+        directions = (INCOMING,) if self.rules.leaves_robot else (INCOMING, OUTGOING)  # OUTGOING is only the robot's
         self.subscriptions[Side.REMOTE] = [
             self.remote.subscribe(filter_, receive, echo=False, direct=True)
             for filter_ in self.subjects.filters(*directions)
@@ -152,14 +152,14 @@ class ForwardingService(Service, ABC):
 
     def synchronize_later(self, side: Side) -> None:
         """Exchange the values in which the sides differ, once the retained messages of ``side`` have arrived."""
-        epoch, end = self.epoch, self.clock() + self.arriving_s  # end: of the wait for late ones
+        epoch, end = self.epoch, self.clock() + self.arriving_s  # end: when the wait for late ones ends
 
         def synchronize() -> None:
             if side is Side.REMOTE and self.forwarder.sides[side].window.is_arriving and self.clock() < end:
                 self.call_at(self.clock() + QUIET_S, synchronize)  # some brokers send them late
             elif side is Side.LOCAL or epoch == self.epoch:  # the remote side has not been lost meanwhile
                 self.forwarder.retained.synchronize(side)
-                # Not earlier: a mirror of a wrong broker has stopped by now. After a loss of LOCAL only bridges probe.
+                # Only now, when a mirror of a wrong broker has stopped. After a loss of LOCAL only bridges probe again.
                 if side is Side.REMOTE or self.rules.leaves_robot:  # leaves_robot: this is the bridge
                     self.forwarder.publisher.probe_commands(*self.probed_sides)
 

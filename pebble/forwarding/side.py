@@ -43,8 +43,8 @@ class SideState:
         self.restarted = False  # its connection was lost; the reconciliation does not know yet
         self._clock, self._wins = clock, wins
         self._lost_at = float("-inf")  # when its state was last another than connected; -inf: never
-        # Its broker has restored older retained messages (if this side wins), or may have; False once all are here.
-        self._went_back = False
+        # This side's broker has restored older retained messages. On the side that does not win: it may have done so.
+        self._went_back = False  # again False once this side's retained messages have arrived
 
     @property
     def connected(self) -> bool:

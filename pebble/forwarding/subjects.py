@@ -109,7 +109,7 @@ class Subjects(dict[str, Subject | None]):
             self._addresses = [Addresses(view_of(config, instance)) for instance in instances]
         self._between_robots = tuple(f"{self._base}/{family}" for family in BETWEEN_ROBOTS)
         self._incoming = f"{self._base}/{INCOMING}/".encode()
-        topics = (topic.encode() for topic in self.topics(*CHANNELS))  # one elsewhere stays whole: it equals no metric
+        topics = (topic.encode() for topic in self.topics(*CHANNELS))  # those elsewhere keep their base: no metrics
         self._known_metrics = frozenset(topic.removeprefix(self._incoming) for topic in topics)
 
     def __missing__(self, topic: str) -> Subject | None:
@@ -154,7 +154,7 @@ class Subjects(dict[str, Subject | None]):
         actions = (channel for channel in CHANNELS if channel.kind is Kind.ACTION)
         return self.topics(*(channel for channel in CHANNELS if channel.payload is Drive), *actions)
 
-    def _find(self, topic: str) -> Subject | None:
+    def _find(self, topic: str) -> Subject | None:  # None: invalid, or not this robot's
         try:
             check_topic(topic)
         except TransportError:

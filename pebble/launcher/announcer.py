@@ -37,8 +37,9 @@ log = logging.getLogger(__name__)
 class Announcer:
     """A publisher of the messages on ``pipe``. It repeats states on every new connection, and sends records once."""
 
-    def __init__(self, pipe: int, transport: Transport) -> None:
-        self._pipe, self._transport = pipe, transport
+    def __init__(self, pipe: int, transport: Transport, stops_of: Config | None = None) -> None:
+        """Store the arguments; ``stops_of``: a robot without a bridge, which would repeat the stops."""
+        self._pipe, self._transport, self._stops_of = pipe, transport, stops_of
         self._states: dict[str, Message] = {}
         self._reactor = Reactor()
         self._wake = WakeupPipe()
@@ -57,6 +58,10 @@ class Announcer:
         notify.ready()
         try:
             self._transport.open(timeout=0.0)
+            if self._stops_of is not None:
+                from pebble.launcher.repeated_stops import repeat_stops  # only who needs it pays for it
+
+                repeat_stops(self._stops_of, self._transport, self._reactor)
             self._reactor.run_until(lambda: self._stopping)
             with suppress(BlockingIOError):
                 while (envelope := next_envelope(self._pipe)) is not None:
@@ -97,13 +102,17 @@ class Announcer:
             self._wake.set()
 
 
-def run(make_transport: Callable[[Message], Transport], hub: AbstractContextManager[ZenohHub | None] = _NO_HUB) -> int:
+def run(
+    make_transport: Callable[[Message], Transport],
+    hub: AbstractContextManager[ZenohHub | None] = _NO_HUB,
+    stops_of: Config | None = None,
+) -> int:
     """Publish the messages on stdin through ``make_transport(will)``, beside the hub; return the exit code."""
     try:
         will = next_envelope(_STDIN)
         if will is None:  # the launcher has ended already
             return 0
-        announcer = Announcer(_STDIN, make_transport(will.message))
+        announcer = Announcer(_STDIN, make_transport(will.message), stops_of)
     except PebbleError as error:
         log.error("the launcher publishes nothing: %s", error)
         return 1
@@ -135,7 +144,8 @@ def main(arguments: list[str]) -> int:
         log.error("%s", error)
         return 1
     set_log_level(config.log_level)
-    return run(lambda will: local_transport(config, "launcher", will=will), _hub(config))
+    stops_of = config if config.motor_owners and not config.services.mqtt_bridge.enabled else None
+    return run(lambda will: local_transport(config, "launcher", will=will), _hub(config), stops_of)
 
 
 def _hub(config: Config) -> AbstractContextManager[ZenohHub | None]:

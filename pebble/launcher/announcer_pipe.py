@@ -1,5 +1,6 @@
 """The pipe from the launcher to the announcer, which publishes for it: a socket pair on which neither side waits."""
 
+import logging
 import os
 import socket
 from typing import Literal
@@ -9,6 +10,8 @@ import msgspec
 from pebble.launcher.reactor import Reactor
 from pebble.runtime.timers import Timer
 from pebble.transports import Message
+
+log = logging.getLogger(__name__)
 
 ENVELOPE_LIMIT = 65_536  # bytes; longer ones are dropped
 _RETRY_S = 0.1  # until the next attempt, when the socket had no room for a state
@@ -33,8 +36,9 @@ class AnnouncerPipe:
         self.dropped = 0  # records, and messages that are too long
         self._reactor = reactor
         self._retry: Timer | None = None  # for another attempt to send states
-        self._states: dict[str, Message] = {}  # the newest of each topic
-        self._unsent: dict[str, Message] = {}  # states that the present announcer has not received
+        self._states: dict[str, bytes] = {}  # the newest of each topic, as it is sent
+        self._unsent: dict[str, bytes] = {}  # states that the present announcer has not received
+        self._too_long: set[str] = set()  # topics of messages that were too long
         self._socket: socket.socket | None = None
 
     def connect(self, will: Message) -> int:
@@ -42,19 +46,22 @@ class AnnouncerPipe:
         self.close()
         self._socket, announcers_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._socket.setblocking(False)
-        self._send("will", will)
+        self._send(_encoded("will", will))
         self._unsent = dict(self._states)
         self._send_states()
         return announcers_end.detach()
 
     def state(self, message: Message) -> None:
         """Send a state, which replaces the former one of its topic."""
-        self._states[message.topic] = self._unsent[message.topic] = message
-        self._send_states()
+        raw = _encoded("state", message)
+        if self._fits(raw, message.topic):
+            self._states[message.topic] = self._unsent[message.topic] = raw
+            self._send_states()
 
     def record(self, message: Message) -> None:
         """Send a message once, after the unsent states; without room it is dropped."""
-        if not (self._send_states() and self._send("record", message)):
+        raw = _encoded("record", message)
+        if self._fits(raw, message.topic) and not (self._send_states() and self._send(raw)):
             self.dropped += 1
 
     def close(self) -> None:
@@ -66,7 +73,7 @@ class AnnouncerPipe:
     def _send_states(self) -> bool:
         """Send the unsent states; True if all are sent. Otherwise arrange another attempt."""
         for topic in list(self._unsent):
-            if not self._send("state", self._unsent[topic]):
+            if not self._send(self._unsent[topic]):
                 if self._socket is not None and self._retry is None:
                     self._retry = self._reactor.after(_RETRY_S, self._retry_now)
                 return False
@@ -77,13 +84,19 @@ class AnnouncerPipe:
         self._retry = None
         self._send_states()
 
-    def _send(self, kind: Kind, message: Message) -> bool:  # False: no announcer, or no room now
-        raw = msgspec.msgpack.encode(Envelope(kind, message))
+    def _fits(self, raw: bytes, topic: str) -> bool:
+        """True if a message can be sent; else it is counted, and for each topic logged once."""
+        if len(raw) <= ENVELOPE_LIMIT:
+            return True
+        self.dropped += 1
+        if topic not in self._too_long:
+            self._too_long.add(topic)
+            log.error("%s is not published: it has %d bytes, and %d is the most", topic, len(raw), ENVELOPE_LIMIT)
+        return False
+
+    def _send(self, raw: bytes) -> bool:  # False: no announcer, or no room now
         if self._socket is None:
             return False
-        if len(raw) > ENVELOPE_LIMIT:  # another attempt would fail, too, and hold up what comes after
-            self.dropped += 1
-            return True
         try:
             self._socket.send(raw)
         except BlockingIOError:
@@ -92,6 +105,10 @@ class AnnouncerPipe:
             self.close()
             return False
         return True
+
+
+def _encoded(kind: Kind, message: Message) -> bytes:
+    return msgspec.msgpack.encode(Envelope(kind, message))
 
 
 def next_envelope(descriptor: int) -> Envelope | None:

@@ -74,7 +74,7 @@ def _system(config: Config, addresses: Addresses) -> offers.SystemOffer:
 def _motor(
     config: Config, addresses: Addresses, lacking: Collection[str]
 ) -> tuple[offers.DriveOffer, offers.EstopOffer, offers.LightsOffer, offers.TelemetryOffer]:
-    """Return the offers of the motor MCU's serial line: drive, stop, lights and telemetry, with their topics in use."""
+    """Return the offers of the motor MCU's line: drive, stop, lights and telemetry. ``lacking``: see `capabilities`."""
     lines, owned = config.motor_lines(), bool(config.motor_owners)
     present = bool(lines)
     name = next(iter(lines), "")  # the first of several lines; "": the section is the only line, or there is none
@@ -131,7 +131,7 @@ def _imu(config: Config) -> tuple[bool, str]:
 
 
 def _outlets(config: Config, features: Collection[str]) -> offers.OutletsOffer:
-    """Return the power outlets of the self-describing MCUs that are connected now, with their topics in use."""
+    """Return the power outlets in use, with their topics. ``features``: ``outlets/NAME/power`` or status of each."""
     topics_of: dict[str, dict[str, str]] = {}  # by the outlet's name
     for key, channel in (("status_topic", c.OUTLET_STATUS), ("command_topic", c.OUTLET_COMMAND)):
         for feature in sorted(features):

@@ -28,7 +28,7 @@ class Child:
         try:
             self.notes, notes_end = _pipe(opened)
             self.output, output_end = _pipe(opened)
-            os.set_blocking(output_end, True)
+            os.set_blocking(output_end, True)  # else a program's output would fail while the pipe is full
             descriptors = {"stdin": stdin, "output": output_end, "notes": notes_end}
             self.pid = _fork(lambda: become(program, environment, config, **descriptors))
             self._reaped = False
@@ -50,7 +50,7 @@ class Child:
             return
         try:
             os.killpg(self.pid, signal.SIGKILL)
-        except (ProcessLookupError, PermissionError):  # all have ended, or run as another user by sudo
+        except (ProcessLookupError, PermissionError):  # all have ended, or are another user's by sudo: the child alone
             os.kill(self.pid, signal.SIGKILL)
 
     def end(self) -> str:

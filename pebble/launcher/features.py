@@ -32,7 +32,7 @@ class Features:
 
     def receive(self, program: str, note: Feature) -> None:
         """Handle a note of ``program``: remember it while it differs from :data:`_EXPECTED`."""
-        report = {(program, note.name)}
+        report = {(program, note.name)}  # a set of one: `_set` gets all reports that count now
         is_as_expected = note.has == (note.name in _EXPECTED)
         if is_as_expected:
             self._set(self._reports - report)

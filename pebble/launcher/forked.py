@@ -92,8 +92,8 @@ def _run(program: Program) -> None:
     sys.argv = [program.module, *program.arguments]
     if ":" in program.module:  # module:function
         sys.exit(run(part(program.module)))
-    if not hasattr(sys.modules.get(program.module), "__path__"):  # of a package its __main__ runs: it stays
-        sys.modules.pop(program.module, None)  # imported before the fork; python -m has it as __main__ only
+    if not hasattr(sys.modules.get(program.module), "__path__"):  # no package, whose __main__ would run
+        sys.modules.pop(program.module, None)  # it was imported before the fork; python -m has it only as __main__
     runpy.run_module(program.module, run_name="__main__", alter_sys=True)
 
 

@@ -78,6 +78,10 @@ class Launcher:
             self._signals.install()
             for place in filter(None, (extension.prepare for extension in config.installed)):
                 part(place)(config)
+            if config.transport.kind == "mqtt":
+                from pebble.launcher.left_states import remove_left_states  # few robots need it
+
+                remove_left_states(config, [supervisor.program.name for supervisor in self._supervisors])
             try:
                 self._reactor.every(_RUN_DIR_S, lambda: self._keep(lock))
                 self._start()
@@ -123,9 +127,9 @@ class Launcher:
         by_extensions = {program: name for name, program in motors_of(self._config.installed, self._config).items()}
         owners = [*map(program_of, self._config.motor_lines()), *by_extensions]
         return Driveable(
-            {program: name for program, name in (lines | by_extensions).items() if program in running},  # with a state
-            [program for program in owners if program in running],  # with motors
-            ["mqtt_bridge"] if "mqtt_bridge" in running else [],  # through which drive commands come
+            {program: name for program, name in (lines | by_extensions).items() if program in running},  # lines
+            [program for program in owners if program in running],  # owners: with motors
+            ["mqtt_bridge"] if "mqtt_bridge" in running else [],  # ways: through which drive commands come
             lambda: self._status.changed(),
         )
 

@@ -70,7 +70,7 @@ def _transport_modules(config: Config) -> tuple[str, ...]:
     kinds = {config.transport.kind}
     if config.transport.mqtt_mirror is not None:
         kinds.add("mqtt")
-    if bridge.enabled:
+    if bridge.enabled:  # without ``remote`` its remote side is ``remote_mqtt``
         kinds.add("mqtt" if bridge.remote is None else bridge.remote.kind)
     modules = map(module_of, sorted(kinds))
     return tuple(module for module in modules if module is not None)

@@ -103,7 +103,7 @@ class StatusPublisher:
         self._status_due = False
         shown = [supervisor for supervisor in self._supervisors if supervisor.shown]
         in_use = {supervisor.program.name: self._state(supervisor) for supervisor in shown if not _rests(supervisor)}
-        self._systemd.status(_summary(in_use))  # without on-demand programs that nothing requests now
+        self._systemd.status(_summary(in_use))  # without on-demand programs at rest, which operators do see, below
         not_installed = ServiceState(state="failed", last_exit="not installed")
         states = {extension.name: not_installed for extension in self._config.missing}
         states |= {supervisor.program.name: self._state(supervisor) for supervisor in shown}

@@ -60,7 +60,7 @@ class MotorGuard:
         self._hold_until: float | None = None  # the end of the hold of the person who commanded last
         self._barred = 0  # the newest barred run, as saved and published last
         self._log = RateLimitedLog(log, burst=5)
-        self._can_save = False
+        self._can_save = False  # the file can be written, as far as :meth:`begin` and :meth:`save_again` know
 
     def begin(self, now: float) -> None:
         """Continue with the state in the file, and publish it."""
@@ -70,7 +70,7 @@ class MotorGuard:
         saved = self._file.load()
         if saved is not None:
             self._latch.restore(saved)
-            self._save()  # again: a process that was killed while it wrote may have left what a power cut undoes
+            self._save()  # once more: what a process wrote that was killed meanwhile may not be on the disk yet
         barred = self._barred_file.load()
         if type(barred) is int and 0 < barred <= LAST_RUN:
             self._arbiter.bar(barred)
@@ -121,7 +121,7 @@ class MotorGuard:
         account = self._control.account(drive)
         limit: int = self._arbiter.judge(drive.moves, run, valid_ms, ms(now), key, account)
         self._note_barred(now)
-        if limit == REFUSED:
+        if limit == REFUSED:  # by the latch, the arbiter or the lease, which is asked again for the reason alone
             needs_no_key = run != PERSON or account is None  # a script, or another program of the robot
             is_stranger = self._control.lease.refuses(drive.moves, needs_no_key, key, account or "", ms(now))
             reason = self._reason_of_refusal(drive.moves, is_stranger, now)

@@ -34,7 +34,6 @@ class MotorOwner(Service, ABC):
     halts in its ``start()``, before anything can arrive, and at its end, by :meth:`on_stop`.
     """
 
-    publishes: ClassVar[tuple[c.Channel, ...]] = (c.ESTOP_STATE, c.CONTROL_STATE, c.CONTROL_TURN)
     #: Commands, such as lights, that it carries out with the drive command of the same group (pebble.contract.groups).
     company: ClassVar[tuple[c.Channel, ...]] = ()
 
@@ -201,7 +200,7 @@ class MotorOwner(Service, ABC):
             self._guard.bar(turn.barred, self.clock())
             self._note_control()
         if batch.lost:
-            self._control.doubt(self.clock())  # no silence until now counts against the holder of control
+            self._control.doubt(self.clock())  # renewals may be among them: no silence of the holder until now counts
         for received in batch.drives:
             if not (only_halts and received.drive.moves):  # after a stop that latches, the guard refuses them
                 self._drive(received)
@@ -246,7 +245,7 @@ class MotorOwner(Service, ABC):
         now = self.clock()
         if now - received.at > c.CONTROL.waits_s and not received.request.ends():
             self.count_late(c.CONTROL)
-            self._control.doubt(now)  # no silence until now counts against the holder of control
+            self._control.doubt(now)  # others may be as late: no silence of the holder until now counts
             return
         self._control.request(received.request, received.over, now)  # ``over``: without asking the holder
         self._note_control()
@@ -293,7 +292,7 @@ class MotorOwner(Service, ABC):
         self._estop_note.report("estop", self.announced_latching)
 
     def _announce_latching(self) -> None:
-        if self.announced_latching:
+        if self.announced_latching:  # set by the caller: this is what is to be announced
             self.log.warning("the subscriptions to the emergency stop are granted again: a stop latches")
             self.repeat_state()
             return

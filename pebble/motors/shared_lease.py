@@ -87,10 +87,10 @@ class FollowingLease(SharedLease):
             return
         self._followed, self.until = turn, turn.t + FOLLOWS_MS
         if earlier is None or (turn.boot, turn.turn) != (earlier.boot, earlier.turn):
-            holder = (turn.account, turn.id, turn.by, turn.device) if turn.key else ()
+            holder = (turn.account, turn.id, turn.by, turn.device) if turn.key else ()  # a client, see Lease
             self.take(holder, 0, now)  # 0: the lease makes no key of its own
             self.key = turn.key
-        asker = ("", turn.asks_id, turn.asks, "") if turn.asks_id else ()  # a turn has neither its account nor device
+        asker = ("", turn.asks_id, turn.asks, "") if turn.asks_id else ()  # a turn lacks its account and device
         self.changed = self.changed or (asker, turn.others) != (self.asker, self.others)
         self.asker, self.others = asker, turn.others  # others: as at the first owner, see Lease
 

@@ -32,8 +32,8 @@ class BoundedOutput:
         self._tokens, self._filled_at = self._most, now  # lines that may pass now, and when that was computed
         self._newest, self._newest_at, self._repeats = b"", now, 0  # line, without its time, and its repetitions
         self._left_out = 0  # lines that were not written yet, because too many came
-        self._kept: deque[bytes] = deque(maxlen=KEPT)  # the newest of these, which are written after all
-        self._suppressed_at, self._said_at = float("-inf"), now  # when a line was left out, and when that was written
+        self._kept: deque[bytes] = deque(maxlen=KEPT)  # the newest of those, which are written after their number
+        self._suppressed_at, self._said_at = float("-inf"), now  # when a line was dropped, and a count written, last
 
     @property
     def waits(self) -> bool:
@@ -43,11 +43,11 @@ class BoundedOutput:
     def feed(self, data: bytes, now: float) -> None:
         """Handle a chunk of output."""
         self.tick(now)
-        if self.flooded and len(data) > 2 * _SKIM:
+        if self.flooded and len(data) > 2 * _SKIM:  # the flood goes on: only its end is read
             data = self._skim(data, now)
         for line in self._lines.feed(data):
             self._line(line.rstrip(), now)
-        self.flooded = self._suppressed_at == now
+        self.flooded = self._suppressed_at == now  # a line of this chunk was dropped
 
     def _skim(self, data: bytes, now: float) -> bytes:
         """Return the last lines of a large chunk; count the others without reading them."""

@@ -59,7 +59,7 @@ def _accounts(settings: ZenohSettings) -> Admission | None:
     from pebble.extension import ours, part  # only who needs it pays for it
 
     for extension in ours():
-        if extension.accounts:
+        if extension.accounts:  # names its class of accounts: one extension has one
             accounts: Admission = part(extension.accounts)(settings.access, settings.wills, settings.unretained)
             return accounts
     raise TransportError("transport.access: is of the extension fleet, which is not installed")

@@ -35,7 +35,7 @@ def run(service_class: type[Service], arguments: list[str] | None = None) -> int
     set_up_logging("INFO")
     try:
         config = config_of_process(arguments[0])
-        withhold(config.password_variables)
+        withhold(config.password_variables)  # from the programs that the service starts
         set_log_level(config.log_level)
         return _serve(service_class, view_of(config, instance), instance)
     except PebbleError as error:

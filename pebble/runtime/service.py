@@ -72,9 +72,8 @@ class Service:
     Only two things run on other threads: jobs for :meth:`run_if_idle`, while the service is idle, and handlers marked
     ``direct``, at any time.
 
-    A subclass gives ``name`` and ``publishes``, marks methods with ``@on`` and ``@every``, opens its device in
-    ``start`` and leaves it safe in ``stop``. A reader thread of a blocking device only ever calls ``post`` or
-    ``run_if_idle``.
+    A subclass gives ``name``, marks methods with ``@on`` and ``@every``, opens its device in ``start`` and leaves it
+    safe in ``stop``. A reader thread of a blocking device only ever calls ``post`` or ``run_if_idle``.
     Every attribute is set in ``__init__``. ``start`` opens, and registers with :meth:`on_stop` what closes::
 
         def __init__(self, *arguments: Any, **options: Any) -> None:
@@ -89,7 +88,6 @@ class Service:
     """
 
     name: ClassVar[str]
-    publishes: ClassVar[tuple[Channel, ...]] = ()
     client_name: ClassVar[str] = ""  # of its transport, after the robot's base; empty: the service's name
     as_published: ClassVar[bool] = False  # its transport shows retain flags as they were published (T7)
 
@@ -160,7 +158,7 @@ class Service:
             self._send(channel, topic, raw)
 
     def listen(self, channel: Channel, method: Callable[..., None], *, direct: bool = False) -> Subscription:
-        """Handle ``channel`` until the returned subscription is closed; ``@on`` does the same for the whole run."""
+        """Handle ``channel`` until the subscription is closed, as ``@on`` does for the whole run, also ``direct``."""
 
         def deliver_direct(message: Message, value: Any, names: dict[str, str]) -> None:
             method(value, self.clock() - message.waited_s, **names)

@@ -64,7 +64,7 @@ class RateController:
         self._steps, self._outgoing = steps(bundle, bitrate), outgoing
         self._levels = LevelControl(len(self._steps) - 1, now)
         self._in_flight = InFlight(_OVERHEAD, _LIMIT)
-        self._rests, self._is_resting = Rests(thin), False
+        self._rests, self._is_resting = Rests(thin), False  # pauses after slow packets; one lasts, by the last poll
         self._age_s = 0.0  # of the oldest packet in flight, beyond a round trip
 
     @property
@@ -105,10 +105,10 @@ class LevelControl:
 
     def __init__(self, last: int, now: float) -> None:
         self.level = self._last = last  # which step; 0 is as configured
-        self._slow_since: float | None = None  # since when packets wait too long
-        self._fast_since: float | None = None  # since when none does
+        self._slow_since: float | None = None  # since when packets wait too long (_SLOW_S)
+        self._fast_since: float | None = None  # since when they wait briefly (_FAST_S)
         self._polled_at = float("-inf")
-        self._empty_at = float("-inf")  # when nothing waited
+        self._empty_at = float("-inf")  # when a poll last found that nothing waits (_EMPTY_S)
         self._changed_at = now
         self._raised_at = float("-inf")  # when the quality last rose
         self._calm_s = _FIRST_CALM_S  # how long it has to be fast before a step up

@@ -29,7 +29,6 @@ class AudioPublisher(Service):
     """
 
     name = "audio_publisher"
-    publishes = (MEDIA_REPORT, AUDIO)
     client_name = "local-audio-publisher"
 
     def __init__(self, *arguments: Any, **options: Any) -> None:

@@ -44,8 +44,10 @@ class Player:
         self._child: Child | None = None
         self._pipe = -1  # its standard input, while there is one
         self._format = (0, 0)  # rate, channels
-        self._started_at = self._retry_at = self._played_at = float("-inf")
-        self._back_off_s = _BACK_OFF_S
+        self._started_at = float("-inf")  # when the program was last started
+        self._played_at = float("-inf")  # when a chunk last came
+        self._retry_at = float("-inf")  # when the program may be started again
+        self._back_off_s = _BACK_OFF_S  # how long it waits after the next failure
         if shutil.which(self._name) is None:
             self._failed(f"{self._name} is not installed", time.monotonic())
 
@@ -73,10 +75,10 @@ class Player:
         self._end(0.0)
 
     def _start(self, chunk: Chunk, now: float) -> Child | None:
-        words = self._options.words(chunk.rate, chunk.channels)
+        command = self._options.words(chunk.rate, chunk.channels)
         self._format, self._started_at = (chunk.rate, chunk.channels), now
         try:
-            child = Child(words, child_environment(), stdin=subprocess.PIPE, stdout=subprocess.DEVNULL)
+            child = Child(command, child_environment(), stdin=subprocess.PIPE, stdout=subprocess.DEVNULL)
         except (OSError, ValueError) as error:
             missing = isinstance(error, FileNotFoundError)
             self._failed(f"{self._name} is not installed" if missing else f"cannot run {self._name}: {error}", now)

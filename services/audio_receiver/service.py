@@ -30,7 +30,6 @@ class AudioReceiver(Service):
     """
 
     name = "audio_receiver"
-    publishes = (MEDIA_REPORT,)
     client_name = "local-audio-receiver"
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
@@ -65,6 +64,7 @@ class AudioReceiver(Service):
     # -- the thread between the network and the playing program, on which writes may block
 
     def _play(self) -> None:
+        """Put packets that come into the buffer, and play the sound that is due, until the service stops."""
         try:
             while not self._stopping.is_set():
                 wait = self._buffer.wait(time.monotonic())
@@ -75,7 +75,7 @@ class AudioReceiver(Service):
                 chunk = self._buffer.take(time.monotonic())
                 if chunk is not None:
                     self._player.play(chunk)
-                elif self._buffer.wait(time.monotonic()) is None:
+                elif self._buffer.wait(time.monotonic()) is None:  # nothing is due before another packet comes
                     self._player.idle()
         finally:
             self._player.close()

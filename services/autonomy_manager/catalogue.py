@@ -169,10 +169,10 @@ class Catalogue:
         version = entry, stamp(entry), stamp(folder / MANIFEST)
         version_before, before, until = self._answers.get(name, (None, _Answer(Description()), 0.0))
         is_current = version_before == version and self._clock() < until
-        if is_current or (version_before is not None and not asks):  # until it is asked again, the old answer does
+        if is_current or (version_before is not None and not asks):  # unasked, its old answer counts
             return before
         answer = self._describe(folder, entry, section, asks=asks)
-        if not answer.asked:
+        if not answer.asked:  # it is asked later: nothing to keep
             return answer
         if answer.problem and answer.problem != before.problem:
             what = "cannot be started" if answer.broken else "is offered without settings"
@@ -265,7 +265,7 @@ class Catalogue:
 
 
 def files(scripts: Iterable[Script]) -> list[dict[str, object]]:
-    """Return the ``files`` of `autonomy-files`; from the first form on that would make it too long, without forms."""
+    """Return the ``files`` of `autonomy-files`. If a form would make it too long, it and all later ones are omitted."""
     entries: list[dict[str, object]] = []
     room = _LONGEST_FILES
     for script in scripts:
@@ -292,15 +292,19 @@ def _inside(root: Path) -> list[Path]:
         return []
 
 
-def _merged(first: Description, second: Description) -> Description:
-    """Return ``first``, with its missing fields taken from ``second``."""
-    keys = {setting.key for setting in first.configs}
+def _merged(manifest: Description, answer: Description) -> Description:
+    """Return a manifest's description, with its missing fields taken from the script's own answer.
+
+    The manifest has no ``command``, else the script is not asked. ``drives`` the caller takes from the answer itself.
+    """
+    keys = {setting.key for setting in manifest.configs}
+    added = [setting for setting in answer.configs if setting.key not in keys]
     return Description(
-        label=first.label or second.label,
-        summary=first.summary or second.summary,
-        main=first.main or second.main,
-        configs=[*first.configs, *(setting for setting in second.configs if setting.key not in keys)][:MAX_SETTINGS],
-        dependencies=first.dependencies or second.dependencies,
+        label=manifest.label or answer.label,
+        summary=manifest.summary or answer.summary,
+        main=manifest.main or answer.main,
+        configs=[*manifest.configs, *added][:MAX_SETTINGS],
+        dependencies=manifest.dependencies or answer.dependencies,
     )
 
 

@@ -42,7 +42,7 @@ def facts(config: Config) -> Facts:
     except ModuleNotFoundError:  # a system without fcntl runs no robots
         return Facts()
     scans: list[dict[str, Script]] = []
-    Catalogue(config, asks=False).scan(scans.append)  # once, as no script is asked
+    Catalogue(config, asks=False).scan(scans.append)  # calls append once, as no script is asked
     return Facts(table=tuple(("script", name, _fitness(config, script)) for name, script in scans[-1].items()))
 
 

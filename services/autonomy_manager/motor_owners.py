@@ -88,7 +88,7 @@ class MotorOwners:
             if state.latched or (state.boot == boot and state.count != count):
                 return _stopped(owner, state)
             # An owner bars all runs up to a number: that before a run that begins, or the newest as a person drives.
-            # The number in ``baseline`` it had barred before this run began.
+            # ``barred`` is the number up to which it had barred runs before this one began.
             is_barred = state.last_barred != barred and not newer(run, state.last_barred)
             if signs and is_barred:
                 # A newer run has begun if one is barred, or a command of one was received.

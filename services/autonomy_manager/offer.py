@@ -29,8 +29,8 @@ class Offer:
         self._fixed = fixed is not None
         self.complete = self._fixed  # the folders were searched at least once; fixed scripts have none
         self._config, self._post, self._on_change = config, post, on_change
-        self._files: list[dict[str, object]] | None = None
-        self._wanted, self._ended = threading.Event(), False
+        self._files: list[dict[str, object]] | None = None  # as ``on_change`` got it last
+        self._wanted, self._ended = threading.Event(), False  # for the thread: list again; end
 
     def begin(self) -> bool:
         """Begin to list the scripts; return True if :meth:`scan` is to be called now and then, to list them again."""

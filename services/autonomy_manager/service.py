@@ -48,7 +48,6 @@ class AutonomyManager(Service):
     """The manager of scripts. ``spawn`` and ``scripts`` replace processes and folders in tests."""
 
     name = "autonomy_manager"
-    publishes = (AUTONOMY_FILES, AUTONOMY_STATUS, DRIVE)
 
     def __init__(
         self, *arguments: Any, spawn: Spawn | None = None, scripts: Mapping[str, Script] | None = None, **options: Any
@@ -66,8 +65,8 @@ class AutonomyManager(Service):
         self._offer = Offer(self.config, self.post, self._publish_files, scripts)
         self._overridden_until = float("-inf")  # until then a person drives, not the script that runs
         self._refused_until = float("-inf")  # until then the arbiter refuses scripts, so none is started
-        self._status: AutonomyStatus | None = None
-        self._connected_before = False
+        self._status: AutonomyStatus | None = None  # as published last
+        self._connected_before = False  # on_connected was called
         self._waiting: Callable[[], None] | None = None  # a start, until its script is listed
         self._signs = True  # the newest run's script signs its drive commands; else they look like a person's
         self._unsigned_moves = False  # while it does not sign: the newest command without a signature moves the wheels
@@ -87,7 +86,7 @@ class AutonomyManager(Service):
         if not self._connected_before:
             self._connected_before = True
             self.listen(CONTROL_STATE, self._control)
-            try:  # a predecessor may have been killed with its script: a zero of a newer run bars that
+            try:  # a killed predecessor's script may still drive: the zero of a newer run bars its run
                 self.halt(next_run(self.config, self._owners.barred))
             except PebbleError as error:
                 self.log.error("%s", error)
@@ -104,8 +103,8 @@ class AutonomyManager(Service):
             self.log_limited.warning("command", "ignored a command that neither starts nor stops a script")
         elif begin:
             by = command.by if isinstance(command.by, str) else None
-            start = partial(self._start_script, (command.file or "").strip(), command.config or {}, by)
-            start(self.clock() + _LISTED_S)  # until then it may wait for the list of scripts
+            until = self.clock() + _LISTED_S  # until then the start may wait for the list of scripts
+            self._start_script((command.file or "").strip(), command.config or {}, by, until)
         else:
             self._runner.stop()
 
@@ -149,6 +148,9 @@ class AutonomyManager(Service):
             raise StoppedError(f"{failed}: {refusal}")
         if self.clock() < self._refused_until:
             raise StartError(f"{failed}: {OVERRIDDEN} just now: start it again in {_HOLD_S:g} s")
+        # If the person never lets go, :meth:`_check_override` would end it: nothing else holds its commands back.
+        if not wanted.main.script.ours and self._person_moves and self.clock() < self._overridden_until:
+            raise StartError(f"{failed}: a person drives: start it again after {_HOLD_S:g} s without a command")
 
     # -- what the motors and people do
 
@@ -162,7 +164,7 @@ class AutonomyManager(Service):
         if run is not None and (why := self._owners.ending(run.number, run.baseline, self._signs)):
             self._runner.stop(why, stopped=stopped)
         if self._runner.stopped and not stopped:  # its error is a stop, which was reset
-            self._runner.refuse(None)  # scripts may start again
+            self._runner.refuse(None)  # None: scripts may start again
 
     def _control(self, state: ControlState, owner: str) -> None:
         self._owners.receive_control(owner, state)
@@ -235,7 +237,7 @@ class AutonomyManager(Service):
             self._local.release()
             raise
         self._signs, self._unsigned_moves = plan.main.script.ours, False
-        for number in self._owners.steps_to(run):  # zeros on the way, or an owner may take this run for an older one
+        for number in self._owners.steps_to(run):  # zeros of numbers in between: else an owner may think it older
             self.halt(number)
         return run, self._owners.baseline()
 

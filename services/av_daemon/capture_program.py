@@ -50,7 +50,7 @@ class CaptureProgram:
         while True:
             remaining_s = deadline - time.monotonic()
             if remaining_s <= 0:
-                if self._child.wait(0.0) is not None:  # a program that it started holds its output open
+                if self._child.wait(0.0) is not None:  # it ended; one that it started holds its output open
                     raise DeviceError(self._end())
                 raise DeviceError(f"{self.name} hangs: nothing came for {self._silence_s:.0f} s{self._last_error()}")
             ready = dict(self._poll.poll(remaining_s * 1000))

@@ -43,7 +43,6 @@ class AvDaemon(Service):
     """The owner of the devices. Each has a thread, and is open only while its stream has a reader."""
 
     name = "av_daemon"
-    publishes = (MEDIA_STATUS,)
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)

@@ -91,7 +91,7 @@ class Rotated:
         self._turns = {90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
         self._cv2: Any = cv2
         self._camera, self._degrees = camera, degrees
-        self._scratch: Bytes = np.empty(0, np.uint8)
+        self._scratch: Bytes = np.empty(0, np.uint8)  # room for a picture before it is turned
 
     def grab(self) -> Capture:
         capture, original, skipped = self._next()

@@ -189,7 +189,7 @@ class LevelControl:
         load = self._load
         if load > _FULL:
             return self._go_down(load, now)
-        # Good times: one step up would keep the load below _AIM. Otherwise they begin anew.
+        # Good times begin anew while there is no step up, or one that would raise the load above _AIM.
         if self.level == 0 or load * STEPS[self.level - 1].cost / self.step.cost > _AIM:
             self._good_since = now
         elif now - self._good_since >= self._patience:
@@ -223,7 +223,7 @@ class LevelControl:
         if self._rose_at is not None and now - self._rose_at < _PROBATION_S:
             self._patience = min(_LONGEST_PATIENCE_S, max(_PATIENCE_S, 2 * self._patience))
             if load <= 2 * _FULL:
-                affordable = self.step.cost  # only one step down, to where it came from; above, as far as necessary
+                affordable = self.step.cost  # one step down, to where it came from; at a higher load further
         self._rose_at = None
         level = next((level for level in lower if STEPS[level].cost <= affordable), len(STEPS) - 1)
         return self._change(level, now)

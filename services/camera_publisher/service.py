@@ -34,7 +34,6 @@ class CameraPublisher(Service):
     """The sender of pictures. While the remote broker is away it encodes nothing, and soon reads nothing either."""
 
     name = "camera_publisher"
-    publishes = (MEDIA_REPORT, CAMERA)
     client_name = "local-camera-publisher"
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
@@ -102,12 +101,12 @@ class CameraPublisher(Service):
 
     def _open_encoder(self, name: str) -> VideoEncoder:
         options = self._options
-        # An interval meant for JPEGs would make H.264 three times as large.
-        applies = name != "h264" or options.encoding == "h264"
+        # Unless the config is for H.264, its interval is meant for JPEGs, and would make H.264 three times as large.
+        uses_interval = name != "h264" or options.encoding == "h264"
         return make_encoder(
             name,
             fps=self._fps,
-            keyframe_interval=options.keyframe_interval if applies else None,
+            keyframe_interval=options.keyframe_interval if uses_interval else None,
             quality=options.jpeg_quality,
         )
 
@@ -150,10 +149,11 @@ class CameraPublisher(Service):
             frame.release()
 
     def _send_frame(self, frame: Frame) -> None:
+        """Encode a frame and send it, unless it was overwritten meanwhile or the connection takes no more."""
         picture = self._shape.picture(frame, self._rate.step.size)
         payload = self._encode(picture, frame.info.captured_ms)
         now = self.clock()
-        # Only black pictures are noted as equal; any other one is noted as the time, which never repeats.
+        # It measures how long a value stays the same: black pictures have one, any other the time, which never repeats.
         self._blackness.take(_BLACK if is_black(picture) else now, now)
         if not frame.valid():
             self._throw_away("overwritten")  # by the next frame, while it was encoded
@@ -173,6 +173,7 @@ class CameraPublisher(Service):
         self._keyframes.require()
 
     def _sent(self, picture: Pixels, payload: bytes, now: float) -> None:
+        """Count a picture that was sent, and watch it on its way: `_poll` then continues until none is in flight."""
         self._rate.sent(wire_size(self._picture_topic, payload), now)
         self.counters.add("sent")
         self._meter.add(now, len(payload))

@@ -31,7 +31,7 @@ class Shape:
         return np.asarray(cv2.rotate(picture, _TURNS[self._turn]), np.uint8) if self._turn else picture
 
     def _size(self, width: int, height: int, part: Fraction) -> tuple[int, int]:
-        """Return the width and height to which a picture of this size is scaled, before it is turned."""
+        """Return width and height, ``part`` of the full ones, to which this size is scaled before it is turned."""
         if not (width > 0 and height > 0):
             raise PayloadError(f"a picture of {width}x{height} pixels")
         wanted_width, wanted_height = self._wanted

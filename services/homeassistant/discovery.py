@@ -72,7 +72,10 @@ def discovery(base: str, capabilities: dict[str, Any], expose: Collection[str] =
 def _components(
     base: str, capabilities: dict[str, Any], expose: Collection[str], unit: str
 ) -> Iterator[tuple[str, Component]]:
-    """Yield the components by their keys, for what the capabilities offer and Home Assistant can show."""
+    """Yield the components by their keys, for what the capabilities offer and Home Assistant can show.
+
+    ``expose``: the keys of `_BUTTONS` that may be offered. ``unit``: see `discovery`.
+    """
 
     def topic(channel: c.Channel) -> str:
         return topic_of(base, capabilities, channel)

@@ -27,7 +27,7 @@ class HomeAssistantService(Service):
         super().__init__(*arguments, **options)
         self._section = self.config.section(HomeAssistant)
         self._remote = remote_transport(self.config, "homeassistant")
-        self._place = f"{self._section.prefix}/device/{object_id(self.config.base)}/config"
+        self._discovery_topic = f"{self._section.prefix}/device/{object_id(self.config.base)}/config"
         self._capabilities: dict[str, Any] = {}
         self._unit = ""  # of the battery's level, as the robot publishes it
         self._wanted = self._sent = b""  # the discovery message: as it should be, and as it was sent last
@@ -76,10 +76,10 @@ class HomeAssistantService(Service):
         now = self.clock()
         is_due = self._due or self._wanted != self._sent
         if self._wanted and is_due and now - self._sent_at >= APART_S:
-            self._save({*self._retained, self._place})  # first: it has to be emptied even if this process dies now
-            if self._publish(self._place, self._wanted):
+            self._save({*self._retained, self._discovery_topic})  # first: it is to be emptied even after a kill now
+            if self._publish(self._discovery_topic, self._wanted):
                 self._sent, self._sent_at, self._due = self._wanted, now, False
-        in_use = {self._place} if self._section.enabled else set()
+        in_use = {self._discovery_topic} if self._section.enabled else set()
         old = self._retained - in_use
         if old and old <= self._emptied and not self._remote.outgoing.waiting:  # the broker has confirmed all
             self._save(self._retained - old)
@@ -96,7 +96,7 @@ class HomeAssistantService(Service):
         except FileNotFoundError:
             return set()
         except (OSError, msgspec.MsgspecError):  # it may be there
-            return {self._place}
+            return {self._discovery_topic}
 
     def _save(self, topics: set[str]) -> None:
         """Save the topics. Without topics the file is removed: a disabled service is then not started next time."""

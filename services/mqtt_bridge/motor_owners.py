@@ -36,8 +36,8 @@ class MotorOwners:
         for topic, owner in self.topics.items():
             count, count_before = self._messages[topic], self._checked[topic]
             self._checked[topic] = count
-            waits_since, is_live = self._waits_since[topic], count > 1
-            if waits_since is None or (is_live and count != count_before):  # it waits from now on
+            waits_since, is_live = self._waits_since[topic], count > 1  # the first may be a retained one
+            if waits_since is None or (is_live and count != count_before):  # it waits for the next one from now on
                 waits_since = self._waits_since[topic] = now
             reached = now - waits_since < _MISSED_S
             if reached and not is_live:

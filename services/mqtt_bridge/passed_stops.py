@@ -39,17 +39,17 @@ def named(payload: bytes) -> bytes:
 class Pending(Struct, frozen=True):
     """A stop that an owner has not confirmed. ``first``: when it first came; ``at``: when the copy that waits came.
 
-    ``before``: the owner's state then, if it receives the stop without its name: a greater count confirms it, too.
+    ``enough``: if the owner receives the stop without its name, its boot and the count that confirms the stop, too.
     """
 
     stop: EstopCommand
     first: float
     at: float
-    before: EstopState | None
+    enough: tuple[str, int] | None
 
     def is_confirmed(self, state: EstopState) -> bool:
         """True if ``state`` shows the stop, except while a latched owner still has to save it."""
-        counts = self.before is not None and self.before.boot == state.boot and state.count > self.before.count
+        counts = self.enough is not None and self.enough[0] == state.boot and state.count >= self.enough[1]
         return (counts or str(self.stop.stop) in state.recent) and _is_saved(state)
 
 
@@ -61,6 +61,14 @@ class Owner:
         self.pending: Pending | None = None
         self.freed_at = -inf  # when it was last seen free after a stop
         self.withdrawn_at: float | None = None  # since when it publishes that it has no emergency stop
+        self._expected = 0  # its count once it has received every stop that was passed to it
+
+    def expect(self, stop: EstopCommand, first: float, now: float, *, nameless: bool) -> None:
+        """Let this newest stop wait. A count does not tell which stops the owner has received: it must include all."""
+        state = self.state
+        self._expected = max(self._expected, 0 if state is None else state.count) + 1
+        enough = (state.boot, self._expected) if nameless and state is not None else None
+        self.pending = Pending(stop, first, now, enough)
 
     def confirms(self, name: str) -> bool:
         """True if the owner's newest state names this stop, except while a latched owner still has to save it."""
@@ -82,6 +90,8 @@ class Owner:
             self.freed_at = now
         if self.pending is not None and self.pending.is_confirmed(state):
             self.pending = None
+        if self.pending is None or earlier is None or earlier.boot != state.boot:
+            self._expected = state.count
 
 
 def _is_saved(state: EstopState) -> bool:
@@ -116,14 +126,14 @@ class PassedStops:
             first = self._passed.setdefault(name, now)
             if len(self._passed) > NAMES:
                 del self._passed[next(iter(self._passed))]
-            waiting = {key for key, pending in self.pending.items() if pending.stop.stop == name}  # these may lack it
+            waiting = {key for key, pending in self.pending.items() if pending.stop.stop == name}  # not confirmed yet
             reset_since = {key for key, owner in self._owners.items() if owner.freed_at > first} - waiting
             if reset_since:  # this repeats a stop that a reset has ended there: only the other owners get a copy
                 return [_encoded(stop, owner=key) for key in self._owners if key not in reset_since]
             for key, owner in self._owners.items():  # of each owner the newest stop stays pending
                 has_newer = owner.pending is not None and owner.pending.first > first
                 if key not in waiting and not has_newer and not owner.confirms(name):
-                    owner.pending = Pending(stop, first, now, owner.state if nameless else None)
+                    owner.expect(stop, first, now, nameless=nameless)
         return [payload]
 
     def follow(self, owner: str, state: EstopState | None) -> None:

@@ -83,8 +83,8 @@ class SameBrokerProbe:
         self._round += 1
         if not self.send():
             return None
-        barrier(self._remote, remote_topic)  # until the broker has the probe, whose own topic we may not subscribe to,
-        barrier(self._local, self.topic)  # then until the local side has received what had come by then
+        barrier(self._remote, remote_topic)  # until the broker has the probe, whose topic we may not subscribe to there
+        barrier(self._local, self.topic)  # until the local side has received all that came before that
         return self._round if self.both_connected else None
 
     def proves_two_brokers(self, round_: int) -> bool:

@@ -58,7 +58,6 @@ class MqttBridge(ForwardingService):
     """The bridge: it forwards by Table A.1, once it knows that its two sides are not one broker."""
 
     name = "mqtt_bridge"
-    publishes = (c.ONLINE, c.BRIDGE_PROBE, c.CONTROL_VOUCHED)
     client_name = "local-bridge"
     rules = TABLE_A1
     probed_sides = (Side.REMOTE,)
@@ -79,7 +78,7 @@ class MqttBridge(ForwardingService):
         deciding_owner = min(self.config.motor_owners, default="")  # of several, the first by name gives control
         self._control_topic = c.CONTROL_STATE.topic(self.config.base, owner=deciding_owner) if deciding_owner else ""
 
-        # Private topics never leave the robot: none without an extension. A group with a command on one is dropped.
+        # Private topics, which only an extension has, are never forwarded; nor is a group with a command on one.
         private = next((extension.private for extension in self.config.installed if extension.private), "")
         self._private = (part(private) if private else PrivateTopics)(self.config.base)
         self.forwarder.stays = self._private.stays
@@ -93,7 +92,7 @@ class MqttBridge(ForwardingService):
         )
         self._leftover_timer: Timer | None = None
 
-        # Until when the motor owners have been sent all messages. Without pings a loss shows only as a long silence.
+        # The period of which the motor owners have all messages. Without pings only a long silence shows a loss.
         sends_pings = section.remote is None or section.remote.kind == "mqtt"
         self._vouching = Vouching(self.remote, self.clock(), None if sends_pings else self._silence_s)
         self._local_changes = 0  # how often the local connection was made or lost
@@ -218,9 +217,9 @@ class MqttBridge(ForwardingService):
             few = ", ".join(topic[:_LOGGED] for topic in removed[:3]) + (", …" if len(removed) > 3 else "")
             self.log.info("removed %d retained topics that the robot no longer has: %s", len(removed), few)
 
-    def connected(self, side: Side, epoch: int) -> None:
+    def connected(self, side: Side, epoch: int) -> None:  # see ForwardingService
         if side is Side.REMOTE:
-            if self.forwarder.gate is Gate.SHUT:  # otherwise subscribe_remote() does that, as soon as it is called
+            if self.forwarder.gate is Gate.SHUT:  # else subscribe_remote() does that, which follows the check
                 self._publish_heartbeat(at_once=True)
         else:
             barrier(self.transport, self._same_broker.topic)  # until the robot's retained messages have arrived
@@ -230,7 +229,7 @@ class MqttBridge(ForwardingService):
             self._check_brokers()
             return
         self._same_broker.send()  # the new connection may lead to another broker
-        if side is Side.REMOTE and epoch == self.epoch:  # else it was lost: the next connection does it
+        if side is Side.REMOTE and epoch == self.epoch:  # else this connection was lost: the next one subscribes
             self.subscribe_remote()
 
     def subscribe_remote(self) -> None:
@@ -256,7 +255,7 @@ class MqttBridge(ForwardingService):
         if not self._same_broker.possible:
             if self._same_broker.announces:
                 self._same_broker.send()  # our mirror learns by it whether its broker is the remote one
-            self._open()
+            self._begin_forwarding()
         if self.forwarder.gate is Gate.OPEN or not self._same_broker.both_connected:
             return
         # A message to a topic that is subscribed to anyway comes back after all probes that were sent before it.
@@ -268,9 +267,9 @@ class MqttBridge(ForwardingService):
     def _end_round(self, round_: int) -> None:
         """Open the forwarder's gate if no probe came back. If a connection was lost, another round begins."""
         if self._same_broker.proves_two_brokers(round_):
-            self._open()
+            self._begin_forwarding()
 
-    def _open(self) -> None:
+    def _begin_forwarding(self) -> None:
         if self.remote.state is not State.CONNECTED or self.forwarder.gate is Gate.OPEN:
             return
         was_shut = self.forwarder.gate is Gate.SHUT
@@ -280,7 +279,7 @@ class MqttBridge(ForwardingService):
             self.forwarder.sides[Side.LOCAL].subscribing()
             self.subscribe_local()
             self.forwarder.subscribed(Side.LOCAL)
-        self.subscribe_remote()  # only now; the local side is subscribed to while the gate is WAITING
+        self.subscribe_remote()  # only now; the local side was subscribed to while the gate was WAITING
         self.log.info("forwarding between the robot and its remote side")
 
     def found_one_broker(self) -> None:
@@ -350,14 +349,14 @@ class MqttBridge(ForwardingService):
         if message.topic == self._control_topic:
             self._follow_control(message.payload)
         if message.topic == self._stop_topic and not message.retain:  # the owners have it unless one restarts now
-            self._passed_stops.accept(named(message.payload), nameless=not is_named(message.payload))
+            self._passed_stops.accept(named(message.payload), nameless=not is_named(message.payload))  # it gets a name
         self._leftovers.note_local(message)
         for admitted in self._private.admit(message):
             self._react(Side.LOCAL, admitted, self.forwarder.receive(Side.LOCAL, admitted))
 
     def _follow_control(self, payload: bytes) -> None:
         """Note who has control, and the present key: the time stamp of a command with another key is not judged."""
-        keys = None  # no motor owner gives keys: with any key it is judged
+        keys = None  # without a valid state: the stamp of every command is judged
         with suppress(PayloadError):
             state: ControlState = codec.decode(c.CONTROL_STATE, payload)
             keys = frozenset([state.key.encode()]) - {b""}  # none if no client has control: no stamp is judged
@@ -372,7 +371,7 @@ class MqttBridge(ForwardingService):
 
     def receive_remote(self, epoch: int, message: Message) -> None:
         topic = message.topic if self.names is None else self.names[message.topic].topic
-        if epoch != self.epoch or self._private.stays(topic):
+        if epoch != self.epoch or self._private.stays(topic):  # epoch: it is of an earlier connection
             return
         if topic == self._stop_topic:
             if not self._has_passed(message):  # by the connection for stops alone
@@ -422,10 +421,10 @@ class MqttBridge(ForwardingService):
             self.refusals.stale("a command" if channel is None else channel.metric)
             return
         if isinstance(routed.outcome, Drop) and (routed.outcome in _IGNORED or not is_local):
-            return  # it may still be a request if a program of the robot sent it, and the reason is none of these
+            return  # of dropped messages only the robot's own may be requests, unless dropped for these reasons
         if channel is None or codec.is_blank(message.payload):
             return
-        if not message.retain and routed.outcome is not Drop.KNOWN:  # observers see what is new, not what is known
+        if not message.retain and routed.outcome is not Drop.KNOWN:  # KNOWN: nothing new for observers
             # With a closed gate both sides may be one broker, and the message an operator's.
             by_robot = is_local and self.forwarder.gate is Gate.OPEN
             self._observers.tell(Observer.passed, channel, ROBOT if by_robot else routed.by, message.payload)

@@ -123,7 +123,7 @@ class StopConnection:
         self._failing_since = float("-inf")  # since when it fails: when it was last well, or not needed
         self._off_until = float("-inf")  # when it is tried again
         self._connected_at = float("inf")  # when it was made last; inf: never
-        self._kicks = 0  # how often in a row the main connection was lost for it
+        self._kicks = 0  # how often in a row the broker ended the main connection soon after this one was made
         transport.policy.is_stop = lambda _topic: True  # it is subscribed to nothing else
         self._reported: bool | None = None  # the log says that it is there, or that it is not
         transport.on_state(self._on_state)
@@ -194,7 +194,7 @@ class StopConnection:
         if state is State.CONNECTED:
             self._connected_at = self._clock()
             return
-        doubtful = self._copies.lost()  # taken for copies, but they may have come over the main connection alone
+        doubtful = self._copies.lost()  # dropped as copies, though perhaps only the main connection had them
         if state is State.CONNECTING:  # it was lost; if it is CLOSED, we have ended it
             for message in doubtful:
                 self._pass_on(message)

@@ -20,7 +20,7 @@ class Vouching:
         """Store the arguments; ``noticed_s``: for a transport without pings, the time after which a loss is noticed."""
         self._remote, self._noticed_s = remote, noticed_s
         self._begin = self._end = now
-        self._losses: Hashable = None
+        self._losses: Hashable = None  # as the last call got them; None: it began anew
 
     def check(self, passes: bool, losses: Hashable, now: float) -> ControlVouched:
         """Update and return the vouched time; ``losses`` changes when a message may have been lost here.

@@ -90,7 +90,7 @@ class MqttMirror(ForwardingService):
     def _check_broker(self, epoch: int) -> None:
         """Watch for probes of the bridge from the broker for some seconds, and forward nothing before that."""
         self.forwarder.rearm()  # if it was shut: from now on messages wait for the result
-        self._announced, self._under_way = False, bool(self._watched)  # until the bridge says that none is under way
+        self._announced, self._under_way = False, bool(self._watched)  # True with a bridge, until it says that none is
         self.unsubscribe(Side.REMOTE)
         self.subscriptions[Side.REMOTE] = [
             self.remote.subscribe(topic, self._from_broker_watched, echo=False, direct=True)
@@ -107,7 +107,7 @@ class MqttMirror(ForwardingService):
             self._request_again()
             self.call_at(self.clock() + _ARRIVAL_S, partial(self._begin, epoch, latest))
             return
-        barrier(self.remote, self._probe_topic)  # a probe that the broker has sent by now counts below
+        barrier(self.remote, self._probe_topic)  # receives what the broker has sent by now; a probe shuts the gate
         if epoch != self.epoch or self.forwarder.gate is not Gate.WAITING:
             return
         if self._is_operators and not self._announced:  # without a new probe the earlier verdict stands
@@ -164,7 +164,7 @@ class MqttMirror(ForwardingService):
             self._under_way = message.payload != NO_PROBE
             if self._under_way:
                 self._announced = True
-                if self._probes.announce(message.payload):  # it came from the broker before: that is the remote one
+                if self._probes.announce(message.payload):  # the broker has sent it already: so it is the remote one
                     self.shut()
 
     def receive_remote(self, epoch: int, message: Message) -> None:

@@ -41,7 +41,6 @@ class NeighboursService(Service):
     """The service of one robot for its neighbours. ``lan`` replaces the connection to the hub in tests."""
 
     name = "neighbours"
-    publishes = (DRIVE, NEIGHBOURS, NEIGHBOUR_VALUE)
 
     def __init__(self, *arguments: Any, lan: Transport | None = None, **options: Any) -> None:
         super().__init__(*arguments, **options)

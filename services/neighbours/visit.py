@@ -45,7 +45,7 @@ class Visit:
         if is_new and not (drive.moves and self._starts(name, drive.run, now)):  # a zero begins no run
             return False
         if drive.moves and not self._sender.ended(now) and self._local_runs():
-            self._sender.end(LOCAL, now)
+            self._sender.end(LOCAL, now)  # then it refuses the command, below
         self._sender.owners(self._states, now)
         valid = drive.valid_ms if isinstance(drive.valid_ms, int) else VALID_MS
         return self._sender.drive(Drive(x=drive.x, z=drive.z, y=drive.y, valid_ms=min(valid, VALID_MS)), now)
@@ -96,7 +96,7 @@ class Visit:
         number = None
         if not why:
             barred = newest(state.last_barred for state in self._states.values())
-            number = self._number(barred, self._received)
+            number = self._number(barred, self._received)  # None while a script of this robot runs
         if number is None:
             refusal = self._refused.get(name)
             if refusal is None or refusal.run != run:  # of one run the first reason is kept

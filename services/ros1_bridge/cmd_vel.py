@@ -177,7 +177,11 @@ class CmdVel:
             self._unlocked_at = time.monotonic()
 
     def settle(self) -> None:
-        """Owe nothing more once a subscriber has had time to receive that the lock is open, and is still connected."""
+        """Owe nothing more once a subscriber has had time to receive that the lock is open, and is still connected.
+
+        Any subscriber, also a recorder: no name tells which of them keeps the lock. One that misses it stays locked
+        until the next reset. To wait for all would be worse: a later process could open a lock that others have set.
+        """
         with self._changed:
             was_told = time.monotonic() - self._unlocked_at > _SURE_S
             if self._lock is not None and self._lock.names and was_told and not self._latched:

@@ -290,7 +290,7 @@ def facts(config: Config) -> Facts:
 
 
 def _facts(section: Ros1) -> Iterator[str]:
-    """Yield the parts of that line: the node, what it drives, and what keeps other programs out after a stop."""
+    """Yield the parts of the summary's line: node, what it drives, and what keeps other programs out after a stop."""
     yield f"node {section.ros.node_name} at {section.master()}"
     if not section.drives:
         yield "reads only"

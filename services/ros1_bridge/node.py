@@ -363,16 +363,19 @@ class Node:
         publication = subscriber.publication
         try:
             chunk = subscriber.sock.recv(4096)
-            if not chunk or publication is not None:
-                raise RosError("it sends what is not expected" if chunk else "it has closed the connection")
-            for header in subscriber.blocks.feed(chunk)[:1]:  # none while it is incomplete
-                self._greet(subscriber, parse_header(header))
+            if not chunk:
+                raise RosError("it has closed the connection")
+            if publication is not None:
+                raise RosError("it sends what is not expected")
+            blocks = subscriber.blocks.feed(chunk)
+            if blocks:  # none while the request is incomplete; what follows it is ignored
+                self._greet(subscriber, parse_header(blocks[0]))
         except BlockingIOError:
             return
         except (OSError, RosError) as error:
             if publication is not None:
                 publication.remove(subscriber, str(error))
-            elif subscriber in self._greetings:
+            elif subscriber in self._greetings:  # else it was added, or ended, already
                 self._end_greeting(subscriber)
 
     def _greet(self, subscriber: Subscriber, fields: Mapping[str, str]) -> None:

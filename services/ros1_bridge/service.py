@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 from pebble.contract import Channel
 from pebble.contract.payloads import Drive
@@ -15,7 +15,7 @@ from pebble.runtime.service import Service, every
 from pebble.services.ros1_bridge.cmd_vel import SILENT_S, CmdVel
 from pebble.services.ros1_bridge.config import NONE, Ros1
 from pebble.services.ros1_bridge.node import Node
-from pebble.services.ros1_bridge.telemetry import PUBLISHES, Telemetry
+from pebble.services.ros1_bridge.telemetry import Telemetry
 
 _CHECK_S = 0.5
 
@@ -24,7 +24,6 @@ class Ros1Reader(Service):
     """A service that publishes the base's reports, and sends nothing to it."""
 
     name = "ros1_reader"
-    publishes: ClassVar[tuple[Channel, ...]] = PUBLISHES
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -74,13 +73,12 @@ class Ros1Bridge(Ros1Reader, MotorOwner):
     """A service that also drives the base. A stop locks the base's multiplexer, so that no ROS program moves it."""
 
     name = "ros1_bridge"
-    publishes = (*MotorOwner.publishes, *PUBLISHES)
     owner = "ros1"
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         ros = self.section.ros
-        self._lock_file = StateFile(self.config.state_file(f"lock-{self.owner}"))
+        self._lock_file = StateFile(self.config.state_file(f"lock-{self.owner}"))  # whether it has locked the base
         self._reported = Reported(self.notifier.mcu)
         self._shown: object = None  # the report of the base that was logged last
         self.cmd_vel = CmdVel(
@@ -89,7 +87,7 @@ class Ros1Bridge(Ros1Reader, MotorOwner):
             ros.cmd_vel_publish_interval_seconds,
             None if ros.estop_topic == NONE else ros.estop_topic,
             None if ros.cancel_topic == NONE else ros.cancel_topic,
-            owed=self._lock_file.load() not in (None, False),  # to unlock it: an unreadable file counts as a lock
+            owed=self._lock_file.load() not in (None, False),  # see CmdVel; an unreadable file counts as a lock
             save=self._lock_file.save,
         )
 

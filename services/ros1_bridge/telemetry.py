@@ -14,14 +14,13 @@ from pebble import contract as c
 from pebble.contract import Channel
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.services.ros1_bridge import messages
-from pebble.services.ros1_bridge.config import CHANNELS, LocalPlan, Metric, Ros1, Sampled
+from pebble.services.ros1_bridge.config import LocalPlan, Metric, Ros1, Sampled
 from pebble.services.ros1_bridge.messages import Form, Goal, Header, Health, Pose
 from pebble.services.ros1_bridge.node import Node
 from pebble.transports.counters import Counters
 
 log = logging.getLogger(__name__)
 
-PUBLISHES = tuple(CHANNELS.values())
 LEVEL_S = 1.0  # between two levels of the battery, at least
 NAVIGATES_S = 5.0  # a planner that is silent for so long does nothing
 _ACTIVE = (0, 1, 6, 7)  # codes of goals that are pursued or about to be

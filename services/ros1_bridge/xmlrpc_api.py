@@ -35,7 +35,7 @@ def call(uri: str, method: str, *arguments: Any) -> Any:
             answer = getattr(proxy, method)(*arguments)
     except (OSError, xmlrpc.client.Error, ValueError, SyntaxError) as error:  # xml's errors are SyntaxErrors
         raise RosError(f"{uri} does not answer {method}: {error}") from error
-    except Exception as error:  # what is no HTTP or XML, as other servers answer
+    except Exception as error:  # another kind of server: its answer is no HTTP, or no XML
         raise RosError(f"{uri} does not answer {method}: {type(error).__name__}") from error
     if not isinstance(answer, (list, tuple)) or len(answer) != 3 or answer[0] != 1:
         raise RosError(f"{uri} answers {method} by {answer!r:.200}")

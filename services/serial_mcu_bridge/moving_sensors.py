@@ -26,7 +26,7 @@ class MovingSensors:
         """The problem in words, or empty. Sensors that have never changed count only if no sensor changes now."""
         still = [name for name, check in self._checks.items() if check.repeats]
         if len(still) < len(self._checks):
-            still = [name for name in still if self._checks[name].changes]
+            still = [name for name in still if self._checks[name].changes]  # which have changed before
         if not still:
             return ""
         verb = "repeats its value" if len(still) == 1 else "repeat their values"

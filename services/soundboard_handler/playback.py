@@ -78,15 +78,15 @@ class Playback:
 
         file = SoundFile(self.clip.path)
         try:
-            words = self._config.section(Media).audio_receiver.words(file.rate, file.channels)
-            player = self._start_player(words, subprocess.PIPE)
+            command = self._config.section(Media).audio_receiver.words(file.rate, file.channels)
+            player = self._start_player(command, subprocess.PIPE)
         except (OSError, ValueError):
             file.close()
             raise
         threading.Thread(target=self._feed, args=(file, player.pipe("stdin")), name="pebble-feed", daemon=True).start()
 
-    def _start_player(self, words: list[str], stdin: int) -> Child:
-        self.process = player = Child(words, child_environment(), stdin=stdin)
+    def _start_player(self, command: list[str], stdin: int) -> Child:
+        self.process = player = Child(command, child_environment(), stdin=stdin)
         player.watch(lambda code: self._post(partial(self._finished, code)))
         return player
 

@@ -37,18 +37,17 @@ class SoundboardHandler(Service):
     """The player of clips, one at a time: the next one starts when the player of the last one has ended."""
 
     name = "soundboard_handler"
-    publishes = (SOUNDBOARD_FILES, SOUNDBOARD_STATUS)
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self._section = self.config.section(SoundboardHandlerSection)
         self._clips = Clips(self._section.playback.directory or in_home("~/sounds"))
-        self._listed: list[str] | None = None
-        self._scan_problem = ""
-        self._playback: Playback | None = None
-        self._started_at = 0.0
+        self._listed: list[str] | None = None  # the clips as published last; None: nothing was published yet
+        self._scan_problem = ""  # of the folder, as logged last
+        self._playback: Playback | None = None  # the player, until its end was handled
+        self._started_at = 0.0  # when the newest player began to play
         self._request: _Request | None = None  # what is played now, or will be when the player has ended
-        self._error: str | None = None
+        self._error: str | None = None  # in the status: why the newest command did not play
         self._talk_back_at = -math.inf  # when audio_receiver last reported that it plays
 
     def start(self) -> None:
@@ -106,6 +105,7 @@ class SoundboardHandler(Service):
         return _Request(clip, math.inf if repeat is True else max(1, repeat or 1))
 
     def scan(self) -> None:
+        """List the clips; publish the list, and log what cannot be read, when that has changed."""
         files = self._clips.scan()
         if self._clips.problem != self._scan_problem:
             self._scan_problem = self._clips.problem
@@ -129,7 +129,7 @@ class SoundboardHandler(Service):
         """Play the waiting request, if there is one."""
         self._playback = None
         if self._request is not None:
-            self._request.starts += 1
+            self._request.starts += 1  # until it was played ``times`` times, see _changed
             self._playback = Playback(self._request.clip, self.config, self.post_first, self._changed)
             self._playback.start()
         else:

@@ -43,10 +43,11 @@ def _without_login(url: str) -> str:
     authority = re.split(r"[/?#\s]", after, maxsplit=1)[0]
     if "@" in authority:
         return f"{before}{slashes}{authority.rpartition('@')[2]}{after[len(authority) :]}"
-    has_password = re.search(r":(?!\d*$)", authority)  # after a colon comes something else than a port
-    if "@" not in after or not has_password:
-        return url  # an @ behind the port is part of a path
-    return f"{before}{slashes}{after.rpartition('@')[2]}"  # the password has a slash
+    # An @ behind the authority is part of a path. But if no port follows its colon, that is a password with a slash.
+    has_password = re.search(r":(?!\d*$)", authority)
+    if "@" in after and has_password:
+        return f"{before}{slashes}{after.rpartition('@')[2]}"
+    return url
 
 
 RULES: tuple[Rule, ...] = ((VideoStream, _check),)

@@ -127,10 +127,11 @@ UNTIL_ENDED = [
     [["fleet", "hub", "HUB"]],
     [["topic", "echo", "a/b", *_AT], _PUBLISH],
     [["topic", "hz", "a/b", *_AT], _PUBLISH],
+    [["topic", "hz", "a/silent", *_AT]],
 ]
 
 
-@pytest.mark.parametrize("commands", UNTIL_ENDED, ids=lambda commands: " ".join(commands[0][:2]))
+@pytest.mark.parametrize("commands", UNTIL_ENDED, ids=lambda commands: " ".join(commands[0][:3]))
 def test_sigterm_is_the_orderly_end_of_a_command_that_runs_until_then(
     tmp_path: Path, broker: Broker, commands: list[list[str]]
 ) -> None:

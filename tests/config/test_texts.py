@@ -142,6 +142,24 @@ def test_a_secret_on_a_command_line_is_not_printed_again(run: Run) -> None:
         (f'"{{\\"api_key\\": \\"{SECRET}\\"}}"', '"{\\"api_key\\": \\"***\\"}"'),
         (f'curl -H "Authorization: Bearer {SECRET}" x', 'curl -H "Authorization: ***" x'),
         (f'"{{\\"Cookie\\": \\"{SECRET}; b\\"}}"', '"{\\"Cookie\\": \\"***\\"}"'),
+        (f"""curl -H 'Authorization: Digest username="u", response="{SECRET}"' x""", "curl -H 'Authorization: ***' x"),
+        (f'{{"Authorization": "Digest username=\\"u\\", response=\\"{SECRET}\\""}}', '{"Authorization": "***"}'),
+        (f"curl -u ann:{SECRET} --user=ann:{SECRET} -uann:{SECRET} x", "curl -u ann:*** --user=ann:*** -uann:*** x"),
+        (f"--password {SECRET} --api-token '{SECRET} {SECRET}' --x", "--password *** --api-token '***' --x"),
+        (f'MQTT_PASSWORD="{SECRET} {SECRET}" x', 'MQTT_PASSWORD="***" x'),
+        (f"sshpass -p {SECRET} x; mysql -u root -p{SECRET} x", "sshpass -p *** x; mysql -u root -p*** x"),
+        (f"mosquitto_pub -p 1883 -P {SECRET} -t x", "mosquitto_pub -p 1883 -P *** -t x"),
+        (f'["mosquitto_sub", "-P", "{SECRET}"]', '["mosquitto_sub", "-P", "***"]'),
+        *[
+            (text, text)
+            for text in (
+                "docker run --user 1000:1000 -p 80:80",
+                "systemctl --no-ask-password reboot",
+                "ssh -p 22 ann@h",
+                "journalctl -u pebble -n 50",
+                "--password-file FILE (--token-file FILE)",
+            )
+        ],
         (f"{{'X-API-Key': '{SECRET}', 'cookie': ''}}", "{'X-API-Key': '***', 'cookie': ''}"),
         ('{"password_file": "x", "token": ""}', '{"password_file": "x", "token": ""}'),
     ],

@@ -13,14 +13,18 @@ from typing import Any
 
 import pytest
 
-from pebble.contract.payloads import LogRecord
+from pebble.config import load
+from pebble.contract import ESTOP, ESTOP_STATE, codec
+from pebble.contract.payloads import EstopCommand, LogRecord
 from pebble.launcher import log_forwarding
 from pebble.launcher.announcer import Announcer
 from pebble.launcher.announcer_pipe import ENVELOPE_LIMIT, AnnouncerPipe, next_envelope
 from pebble.launcher.log_forwarding import LevelReader, LogForwarder, NonBlockingWriter, OwnRecords, text_of
 from pebble.launcher.reactor import Reactor
+from pebble.launcher.repeated_stops import REPEAT_S, repeat_stops
 from pebble.runtime.parent import Notifier
 from pebble.transports import Message, QoS, State
+from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.fakes.recording_transport import RecordingTransport
 from tests.launcher.conftest import lines_of
 from tests.support import WAIT_S, until
@@ -183,13 +187,39 @@ def test_records_that_cannot_be_sent_are_counted(connection: Connection) -> None
     assert connection.pipe.dropped == 3
 
 
-def test_a_state_that_is_too_long_holds_up_no_other(connection: Connection) -> None:
+def test_a_state_that_is_too_long_is_logged_once_and_holds_up_no_other(
+    connection: Connection, caplog: pytest.LogCaptureFixture
+) -> None:
     connection.connect()
-    connection.pipe.state(Message("a", b"x" * ENVELOPE_LIMIT))
+    for _ in range(2):
+        connection.pipe.state(Message("a", b"x" * ENVELOPE_LIMIT))
     connection.pipe.state(Message("b", b"1"))
     connection.pipe.record(Message("logs", b"2"))
     assert connection.received() == [("will", b"gone"), ("state", b"1"), ("record", b"2")]
-    assert connection.pipe.dropped == 1
+    assert connection.pipe.dropped == 2
+    assert caplog.messages == ["a is not published: it has 65611 bytes, and 65536 is the most"]
+
+
+def test_without_a_bridge_a_stop_is_repeated_until_its_owner_names_it(tmp_path: Path) -> None:
+    file, hub, stops = tmp_path / "robot.json", MemoryHub(), list[EstopCommand]()
+    line = {"enabled": True, "serial": {"port": "/dev/null"}}
+    file.write_text(json.dumps({"robot": {"id": "goob"}, "services": {"serial_mcu_bridge": line}}))
+    config, reactor = load(file), Reactor()
+    stop, state = ESTOP.topic(config.base), ESTOP_STATE.topic(config.base, owner="serial")
+    with MemoryTransport("launcher", hub) as launcher, MemoryTransport("other", hub) as other:
+        repeat_stops(config, launcher, reactor)
+        other.subscribe(stop, lambda message: stops.append(codec.decode(ESTOP, message.payload)), echo=False)
+        other.publish(stop, b"{}", qos=QoS.DELIVERED)
+        assert reactor.run_until(lambda: len(stops) > 1, WAIT_S)
+        assert {(repeated.stop, repeated.owner) for repeated in stops} == {(stops[0].stop, "serial")}
+        fields = {"latched": True, "boot": "00000001", "count": 1, "recent": [stops[0].stop], "by": "", "why": ""}
+        fields |= {"since": 0, "persisted": True, "reset_refused": None}
+        other.publish(state, json.dumps(fields).encode(), qos=QoS.DELIVERED, retain=True)
+        reactor.run_until(lambda: False, REPEAT_S)
+        stops.clear()
+        reactor.run_until(lambda: False, 2 * REPEAT_S)
+        assert stops == []
+    reactor.close()
 
 
 def test_states_are_not_lost_to_a_flood_of_records(connection: Connection) -> None:

@@ -97,6 +97,15 @@ def pebble(*arguments: object) -> tuple[int, str]:
     return process.returncode, out + err
 
 
+def test_a_stop_that_comes_once_while_the_motor_owner_restarts_holds_without_a_bridge() -> None:
+    with Rig("single", start=False, mqtt_bridge={"enabled": False}) as rig:
+        rig.start(ready=False)
+        assert until(lambda: rig.operator.newest("estop/serial").get("latched") is False)
+        rig.kill("serial_mcu_bridge")
+        rig.operator.send("incoming/estop", {"by": "ann"})
+        assert until(lambda: rig.operator.newest("estop/serial")["by"] == "ann")
+
+
 @pytest.mark.parametrize("kind", ["mqtt", "zenoh"])
 def test_a_stop_from_either_side_holds_over_restarts_until_its_reset(kind: str) -> None:
     with Rig(kind) as rig:

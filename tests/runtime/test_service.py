@@ -46,7 +46,6 @@ class Recorder(Service):
     """Notes everything that happens to it, and can be made to wait inside a handler."""
 
     name = "recorder"
-    publishes = (CHARGING_STATUS, TOUCH_SENSORS)
 
     def __init__(self, *arguments: Any, **more: Any) -> None:
         super().__init__(*arguments, **more)

@@ -134,7 +134,7 @@ class MemoryTransport(Transport):
             if will is not None and self._present:
                 self._hub.distribute(will, self)
             self._hub.leave(self)
-            self.vanish()
+            self.vanish()  # which also ends the receiving thread
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(1.0)
 
@@ -169,7 +169,7 @@ class MemoryTransport(Transport):
     def _run(self) -> None:
         while True:
             with self._hub.lock:
-                while not (self._stopping or self._inbox or self._attached != self._hub.era):
+                while not (self._stopping or self._inbox or self._attached != self._hub.era):  # the last: see _work
                     self._changed.wait()
                 if self._stopping:
                     return
@@ -203,9 +203,9 @@ class MemoryTransport(Transport):
         self._set_state(State.CONNECTING)
 
     def _connect(self) -> None:
-        self._renew()
+        self._renew()  # base: before the first message of a connection is offered
         with self._hub.lock:
-            if self._stopping or self._hub.era is None:
+            if self._stopping or self._hub.era is None:  # closed, or the hub was stopped, meanwhile
                 return
             self._attached = self._hub.era
             retained_topics = set(self._hub.retained)

@@ -145,7 +145,7 @@ class Client:
     # -- reading
 
     def receive(self) -> int:
-        """Take bytes out of the socket, if all earlier bytes were read; return their number.
+        """Take bytes out of the socket; return their number. Call this when `read` has left none.
 
         If the other side has closed the connection, `socket` is None afterwards.
         """

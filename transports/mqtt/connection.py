@@ -100,7 +100,7 @@ class Connection:
             why = unreached(error, tls=self._settings.tls is not None)
             raise ending(f"{self.where} cannot be reached: {why}") from None
         self.opened_s = time.monotonic() - dialled
-        self.incoming.answered_at = began = clock.since_boot()
+        self.incoming.answered_at = began = clock.since_boot()  # the CONNACK sets it anew
         self.dialling = False
         deadline = time.monotonic() + hosts.CONNECT_TIMEOUT_S
         try:
@@ -187,7 +187,7 @@ class Connection:
             if owes:
                 with self._lock:
                     client.acknowledge()
-        incoming.age.delay.delivered()  # even if there were none: what came before a ping's answer is handled now
+        incoming.age.delay.delivered()  # also without messages: what came before a ping's answer is handled now
         if incoming.age.has_retained:  # their handlers may have taken long: the broker was not silent meanwhile
             incoming.age.note_handled()
         if self.in_flight.answered:
@@ -258,7 +258,7 @@ class Connection:
             client, limits = self.client, self.limits
             if client.socket is None:
                 return False
-            if message.qos is QoS.DELIVERED and self.in_flight.unacked >= UNACKED_LIMIT and self._is_full(message):
+            if message.qos is QoS.DELIVERED and self.in_flight.unacked >= UNACKED_LIMIT and self._is_too_many(message):
                 return False
             # Without QoS 1 nothing is acknowledged: then the bytes that wait are limited.
             if not limits.qos and client.unwritten > _UNWRITTEN and not self._owner.policy.is_stop(message.topic):
@@ -282,7 +282,7 @@ class Connection:
             return True
         return _OVERHEAD + len(message.topic.encode()) + len(message.payload) <= self.max_packet
 
-    def _is_full(self, message: Message) -> bool:
+    def _is_too_many(self, message: Message) -> bool:
         """True if ``message`` is refused at UNACKED_LIMIT, as all are but the next UNACKED_RESERVE emergency stops."""
         beyond = self.in_flight.unacked - UNACKED_LIMIT
         return beyond >= UNACKED_RESERVE or not self._owner.policy.is_stop(message.topic)

@@ -106,7 +106,7 @@ class Dialler:
 
     def _probe(self, owner: Owner, counters: Counters, stopping: threading.Event) -> None:
         """Test whether the broker accepts us without bridge mode; leave our will out, as a failure would publish it."""
-        probe = self._make(None, owner, counters, as_published=False)
+        probe = self._make(None, owner, counters, as_published=False)  # None: no will; False: no bridge mode
         try:
             probe.connect(stopping)
             probe.disconnect()
@@ -149,7 +149,7 @@ class Dialler:
         after the broker has accepted us, as its retained messages may be large.
         """
         attempt = self.attempt
-        if attempt is None or not isinstance(lost, Silent):
+        if attempt is None or not isinstance(lost, Silent):  # without silence only the first sign is possible
             return isinstance(lost, TlsLate)
         answered_s = attempt.incoming.answered_s
         return attempt.in_flight.lost_bytes > _LARGE or (answered_s is not None and answered_s < _SOON_S)
@@ -162,7 +162,7 @@ class Dialler:
         if late:
             self.addresses.was_slow()
         if self.loses_large or not (silent or late):
-            return False  # they are small already, or this loss tells nothing about large packets
+            return False  # they are small already, or it tells nothing of large ones: no silence, no late TLS
         self._large_lost = self._large_lost + 1 if self._may_have_lost_large(lost) else 0
         return self.loses_large
 
@@ -183,17 +183,17 @@ class Dialler:
         return was_ended and not was_silent and now - self._gone_at <= _ENDING_S
 
     def failed(self, problem: str, held_s: float) -> tuple[str, bool]:
-        """Go on to the host's next address, unless this broker will be asked once more in another way.
+        """Go on to the host's next address, unless this broker is to be asked once more (bridge mode, other limits).
 
         ``held_s``: how long a connection lasted, or 0. Return the problem in words ("": none yet), and True to log it.
         """
         addresses, asks_again = self.addresses, self.limits.asks_again
-        if self._is_last_attempt and not asks_again:  # it was asked in every way: bridge mode, limits
+        if self._is_last_attempt and not asks_again:  # it was asked in every way, so this address has failed
             why = problem.removeprefix(f"{addresses.where} ")  # the list of failures names the addresses
             failures = addresses.failed(why, held_s)
             if addresses.several:
                 problem = f"broker {addresses.host_port}: {failures}"
-        if asks_again and held_s <= 0:  # the next attempt shows what the problem is
+        if asks_again and held_s <= 0:  # only an attempt has failed: the next one shows what the problem is
             return "", False
         # Of a round through several addresses, only the end is worth a line.
         return problem, held_s > 0 or addresses.is_over or not addresses.several

@@ -44,7 +44,7 @@ def cover(first: str, second: str) -> str:
         if first_level == "#" or second_level == "#":
             return "/".join([*levels, "#"])
         levels.append(first_level if first_level == second_level else "+")
-    return "/".join(levels if len(first_levels) == len(second_levels) else [*levels, "#"])
+    return "/".join(levels if len(first_levels) == len(second_levels) else [*levels, "#"])  # a/# matches a, too
 
 
 class BrokerFilters:

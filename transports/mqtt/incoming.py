@@ -61,7 +61,7 @@ class Incoming:
         self._refusal: Refused | None = None
         self.reason = ""  # why the broker closed the connection, as its DISCONNECT says
         self.may_concern_message = False  # the reason may be a message of ours
-        self._taken_over = True  # another client may have taken our id: True also where MQTT 3.1.1 cannot tell
+        self._may_be_taken_over = True  # by a client with our id; only a DISCONNECT of MQTT 5 can exclude it
         self.messages: list[Message] = []  # read, and not delivered yet
         self.answers: dict[str, bool] = {}  # new answers: filters, each refused or not
         self.more = False  # a batch ended before the socket was empty
@@ -78,7 +78,7 @@ class Incoming:
         if self.accepted is None:
             return  # `connect` has its own deadline, and gives the first round trip
         silent_s = now - max(self.answered_at, self.age.arriving_at)
-        if silent_s > self.silence_s and silent_s > (limit := self.pings.silence_limit_s):  # never less; slower to get
+        if silent_s > self.silence_s and silent_s > (limit := self.pings.silence_limit_s):  # the quick limit first
             self._counters.add("silences")
             raise Silent(f"{self.where} has not answered for {limit:.1f} s")
 
@@ -131,7 +131,7 @@ class Incoming:
         if now - waiting.checked_at > OVERSLEPT_S and self.accepted is not None:  # no pings before the CONNACK
             self.pings.send_after_stall(client, now)
         size = client.receive()
-        waiting.found(size if client.drained else size + readable_bytes(client.socket), now)  # with what is left
+        waiting.found(size if client.drained else size + readable_bytes(client.socket), now)  # with bytes not read yet
         return size
 
     @property
@@ -144,9 +144,9 @@ class Incoming:
         """Error for a connection that the other side has closed, with the reason."""
         why = self.reason or f"{self.where} closed the connection"
         client_id = self._settings.client_id
-        if client_id is not None and self.accepted is not None and self._taken_over:
+        if client_id is not None and self.accepted is not None and self._may_be_taken_over:
             why += f' (does another client use the client id "{client_id}"? a broker lets in only the newest)'
-        if filters := self._in_flight.asked:
+        if filters := self._in_flight.asked:  # subscriptions without an answer, which may be the reason
             more = f" and {len(filters) - _SHOWN} more" if len(filters) > _SHOWN else ""
             why += f", asked to deliver {', '.join(filters[:_SHOWN])}{more}"
         return Lost(why)
@@ -178,7 +178,7 @@ class Incoming:
 
     def on_disconnect(self, code: int) -> None:
         self.reason = f"{self.where} closed the connection: {reasons.words(code)}"
-        self._taken_over = code == reasons.TAKEN_OVER
+        self._may_be_taken_over = code == reasons.TAKEN_OVER
         self.may_concern_message = reasons.may_concern_message(code)
 
     def on_pong(self) -> None:
@@ -226,9 +226,9 @@ class Incoming:
         qos = QoS.DELIVERED if first & ANY_QOS else QoS.LATEST
         self.messages.append(Message(text, payload, qos, retain, retain_requested, age.since))
 
-    def skips(self, topic: bytes) -> bool:  # if so it counts the packet, which `on_publication` never gets
+    def skips(self, topic: bytes) -> bool:  # if True, it counts the packet itself: `on_publication` is not called
         if self.messages:
-            return False  # what came before may change the answer
+            return False  # these are to be delivered first: they may change the answer
         try:
             skipped = self._owner.policy.skips_retained(topic)
         except Exception:  # foreign code on our thread

@@ -261,7 +261,7 @@ class InFlightTable:
 
     def end(self) -> None:
         """Complete all pending answers, because none can come after the connection's end."""
-        # Those that were written after the newest answered ping, and before the next one:
+        # The first that no answer has followed: written since the newest answered ping, and before the next ping.
         unanswered = self._pings[0].written if self._pings else self._written
         self.lost_bytes = max((size for _, size in unanswered.values()), default=0)
         self.complete()

@@ -246,7 +246,7 @@ class Reader:
                     self._data, self._at = b"", 0
                 break
             size, start = data[at + 1], at + 2  # how many bytes follow the length, which has one to four, and where
-            if size > 127 and start < end and (more := data[start]) < 128:
+            if size > 127 and start < end and (more := data[start]) < 128:  # two bytes, the usual length: no call
                 size, start = size & 127 | more << 7, start + 1
             elif size > 127:
                 size, start = _read_variable(data, at + 1)
@@ -290,14 +290,14 @@ class Reader:
                 self.acks += b"\x50\x02" + data[topic_end:payload_at]
             else:
                 raise MalformedError("a message of QoS 3")
-        if self._modern and payload_at < stop and data[payload_at] < 128:  # then properties, whose length is one byte
+        if self._modern and payload_at < stop and data[payload_at] < 128:  # properties, whose length has one byte
             payload_at += 1 + data[payload_at]
-        elif self._modern and payload_at <= stop:
+        elif self._modern and payload_at <= stop:  # their length has more bytes, or is not there
             size, size_bytes = _read_variable(data[payload_at : min(payload_at + 4, stop)], 0)
             payload_at = stop + 1 if size < 0 else payload_at + size_bytes + size  # stop + 1: refused below
         if payload_at > stop or not topic:
             raise MalformedError("a message that ends in its head" if topic else "a message without a topic")
-        if not (first & RETAIN and payload_at < stop and self._listener.skips(topic)):
+        if not (first & RETAIN and payload_at < stop and self._listener.skips(topic)):  # an empty one is a removal
             self._listener.on_publication(topic, data[payload_at:stop], first)
 
     def _other(self, first: int, body: bytes) -> None:
@@ -326,7 +326,7 @@ class Reader:
         if body[1]:
             self._listener.on_refused(body[1])
             return
-        values = properties(body[2 : 2 + self._properties_size(body)])  # by their numbers; below in Accepted's order
+        values = properties(body[2 : 2 + self._properties_size(body)])  # by number; next in the order of Accepted
         accepted = Accepted(*map(values.get, (_MAXIMUM_PACKET, _RECEIVE_MAXIMUM, _MAXIMUM_QOS, _RETAIN_AVAILABLE)))
         if accepted.receive_maximum is not None:
             self._quota.begin(accepted.receive_maximum)
@@ -343,10 +343,10 @@ class Reader:
             self._keep(start + HEAD - at)
             return
         topic_end = start + 2 + int.from_bytes(data[start : start + 2], "big")
-        ack = b"\x40\x02" + data[topic_end : topic_end + 2] if data[at] & ANY_QOS == _QOS_1 else b""
+        ack = b"\x40\x02" + data[topic_end : topic_end + 2] if data[at] & ANY_QOS == _QOS_1 else b""  # PUBACK
         self._too_long = data[start + 2 : topic_end], stop - start, ack
         self._discarded, self._data, self._at = stop - at, b"", 0
-        self.feed(data[at:])
+        self.feed(data[at:])  # discards what is here of the packet, and keeps what follows it
 
     def _discard(self, data: bytes) -> bytes:
         """Discard bytes of a long packet; return those after it."""

@@ -26,7 +26,7 @@ class Pings:
         self._thin_interval_s = min(_THIN_INTERVAL_S, keepalive_s / 2)
         self.is_thin = False  # see `Transport.is_thin`
         self.due_at = inf  # until `begin`; then regularly, as without pings only what we publish is answered
-        #: Since when nothing had been read when :meth:`send_after_stall` sent its last ping: one for each stall.
+        #: When the stall began for which :meth:`send_after_stall` sent its last ping: it sends one for each stall.
         self._stalled_since = age.waiting.checked_at
 
     def begin(self, now: float) -> None:

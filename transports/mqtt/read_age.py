@@ -69,7 +69,7 @@ class BrokerDelay:
         self._pings: deque[_Ping] = deque()  # oldest first
         self._read_answer = self._delivered_answer = 0.0, 0.0  # when its ping was sent, and how long it took
         self._shortest = _FAR_S
-        self._newest = 0.0  # seconds that the newest answer took; 0: it tells nothing
+        self._newest = 0.0  # seconds that the newest answer took; 0: that tells nothing
         self._came_at = 0.0  # when something was received last
         self._stall = 0.0  # seconds for which the broker stood still; messages count as having waited so long
         self._until = 0.0  # until this time they count so
@@ -95,7 +95,7 @@ class BrokerDelay:
             self._read_answer = ping.sent_at, took_s
             self._newest = took_s if ping.clear else 0.0  # else our own data held up the ping
             self.usual(took_s)  # if it is the shortest
-        is_near = self._shortest <= _NEAR_S  # else the answer to an older ping, too, may come soon after the newest one
+        is_near = self._shortest <= _NEAR_S  # else an older ping's answer may well come soon after the newest ping
         if is_near and self._pings and now - self._pings[-1].sent_at <= self._shortest + _NEAR_S:
             self._prompt += 1
         else:
@@ -132,7 +132,7 @@ class BrokerDelay:
 
         The longest counts, less the time of the way itself.
         """
-        since = sent_at = now
+        since = sent_at = now  # if no ping is unanswered
         for ping in self._pings:
             if ping.clear:  # the oldest one that no other data of ours held up
                 since, sent_at = ping.since, ping.sent_at
@@ -140,7 +140,7 @@ class BrokerDelay:
         if self._came_at <= sent_at and now - sent_at > self._shortest + _NOTICED_S:  # nothing came since the ping
             self._stall, self._until = now - sent_at, now + _BACKLOG_S
         self._came_at = now
-        waited = max(self._newest, now - since, self._stall if now < self._until else 0.0)  # the cases above
+        waited = max(self._newest, now - since, self._stall if now < self._until else 0.0)  # the cases, in their order
         if waited <= self._shortest + _NOTICED_S:
             return 0.0
         # TCP's present round trip, but no less than the usual one, and at most _UPLINK_S more than that.

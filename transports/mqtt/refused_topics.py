@@ -51,7 +51,7 @@ class RefusedTopics:
         self._trial: Trial | None = None
         self._quiet_at = -inf  # a trial begins after this time, which is QUIET_S after the newest loss
         #: Topics that were logged as refused, withheld or not: why, and when that was last in the log.
-        self.not_taken = BoundedTable[tuple[str, float]](TOPICS, TOPICS * MAX_BYTES, lambda _: 0)
+        self.not_taken = BoundedTable[tuple[str, float]](TOPICS, TOPICS * MAX_BYTES, lambda _: 0)  # 0: topics count
 
     def accepts(self, message: Message) -> bool:
         """True if ``message`` may be sent: its topic is not withheld, or is on trial."""
@@ -89,7 +89,7 @@ class RefusedTopics:
         written, trial, self._trial = written or {}, self._trial, None
         self._quiet_at = now + QUIET_S
         ordinary = [topic for topic in written if not self._is_vital(topic)]  # those that may be withheld at any size
-        if trial is not None and ordinary == [trial.topic]:  # of those only it was written
+        if trial is not None and ordinary == [trial.topic]:  # no other ordinary one was written
             self._blame(where, trial.topic, written[trial.topic], now)
             return
         self._losses = {topic: self._losses.get(topic, 0) + 1 for topic in written}
@@ -99,11 +99,11 @@ class RefusedTopics:
             suspects = {topic: size for topic, size in often.items() if not self._is_vital(topic)}
         if len(suspects) == 1:
             self._blame(where, *suspects.popitem(), now)
-        elif suspects:  # any of them, at any size (0) if it is not vital: their trials will show which
+        elif suspects:  # one of these: vital ones are withheld if large, others at any size (0), until a trial
             for topic in suspects:
                 if len(self.withheld) < TOPICS:
                     self.withheld[topic] = Withheld(LARGE if self._is_vital(topic) else 0, now)
-        elif not ordinary:  # only vital ones, which are sent all the same
+        elif not ordinary:  # only vital topics with small messages, which are sent all the same
             for topic, size in often.items():
                 why = f"{_closes(size)}, without which this account cannot run a robot"
                 self.report(where, topic, why, now, logging.ERROR)

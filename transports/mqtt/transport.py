@@ -60,13 +60,13 @@ class MqttTransport(Transport):
         if settings.protocol not in ("3.1.1", "5"):
             raise TransportError(f'protocol must be "3.1.1" or "5", not "{settings.protocol}"')
         self.settings = settings
-        self.as_published = settings.as_published  # in bridge mode on 3.1.1, which also keeps own messages away
-        self.exact_echo = settings.as_published or settings.protocol == "5"  # 5 has noLocal for that
+        self.as_published = settings.as_published  # on 3.1.1 by bridge mode, which also keeps our own messages away
+        self.exact_echo = settings.as_published or settings.protocol == "5"  # by bridge mode, or by noLocal of 5
         self._dialler = Dialler(client_id, settings, will, self.client_class)
         self._connection: Connection | None = None  # the newest one, once it can be used
         self._filters = BrokerFilters()
         self._own_message_filter = OwnMessageFilter()
-        self._network: _Run | None = None
+        self._network: _Run | None = None  # the newest run of the network thread
         self._refused = RefusedTopics(client_id, settings.vital)
         self._logged = ("", 0.0)  # the newest problem in the log, and when it went there
 
@@ -143,28 +143,28 @@ class MqttTransport(Transport):
         with self._filters.lock:
             connection = self._connection
             for subscription in subscriptions:
-                filter_, replaced = self._filters.add(subscription.filter)
+                filter_, replaced = self._filters.add(subscription.filter)  # a wider filter may replace others
                 if connection is not None:
-                    self._own_message_filter.subscribe_again(filter_)
+                    self._own_message_filter.subscribe_again(filter_)  # retained messages are sent once more
                     acks.append(connection.subscribe([(filter_, self._no_local(filter_))]))
                     acks.append(connection.unsubscribe(replaced))
             if connection is None:
                 return  # the next connection subscribes to them
             # Retained messages come after the SUBACK, on a bad network long after it; a ping's answer follows them.
             acks.append(connection.ping())
-        if self._network is None or threading.current_thread() is not self._network.thread:  # the reader of the answers
+        if self._network is None or threading.current_thread() is not self._network.thread:  # which reads the answers
             deadline = time.monotonic() + _ANSWER_S
             for ack in acks:
                 ack.wait(deadline - time.monotonic())
 
-    def ask(self, topics: Collection[str]) -> None:  # by an exact subscription to each, until the answer has come
+    def ask(self, topics: Collection[str]) -> None:  # see Transport.ask: subscribes to each of them for a moment
         deadline = time.monotonic() + _ANSWER_S
         with self._filters.lock:
             connection, unheard = self._connection, [topic for topic in topics if topic not in self._filters]
             if connection is None or not unheard:
                 return
             for topic in unheard:
-                self._own_message_filter.subscribe_again(topic)
+                self._own_message_filter.subscribe_again(topic)  # its retained message comes once more
             # Retained messages come after the SUBACK, to all subscriptions that match; the ping's answer follows them.
             answer = connection.subscribe([(topic, self._no_local(topic)) for topic in unheard], QoS.LATEST)
             acks = [answer, connection.ping(), connection.unsubscribe(unheard)]
@@ -188,7 +188,7 @@ class MqttTransport(Transport):
     # -- the network thread
 
     def _run(self, run: _Run) -> None:
-        failures, stopping = 0, run.stopping  # failures before the present one: after the first there is no pause
+        failures, stopping = 0, run.stopping  # failures in a row before this one: after the first there is no pause
         while not stopping.is_set():
             began, problem = time.monotonic(), "failed unexpectedly"
             try:
@@ -212,7 +212,7 @@ class MqttTransport(Transport):
             if self._dialler.addresses.several and not self._dialler.addresses.is_over:
                 continue  # the next address
             pause = min(self.settings.reconnect_max_s, _RETRY_S * 2 ** (failures - 1)) if failures else 0.0
-            if not self._dialler.limits.asks_again:  # a broker that is asked in another way has not failed
+            if not self._dialler.limits.asks_again:  # else it is asked in another way now: that is no failure yet
                 failures = min(failures + 1, 20)  # bounded, because it is an exponent
             stopping.wait(pause * random.uniform(0.5, 1.0))  # noqa: S311  (jitter, no secret)
 
@@ -235,7 +235,7 @@ class MqttTransport(Transport):
                 is_granted = connection.incoming.as_published
                 if self.as_published and not is_granted:
                     log.warning("%s has no bridge mode: own messages come back on this connection", connection.where)
-                self.as_published = self.exact_echo = is_granted
+                self.as_published = self.exact_echo = is_granted  # if not, own messages come back: no exact echo
             self._serve(connection, run)
             self._finish(connection, run.will)
         finally:
@@ -245,7 +245,7 @@ class MqttTransport(Transport):
             self._keep_unconfirmed(connection)
 
     def _serve(self, connection: Connection, run: _Run) -> None:
-        tried_at = time.monotonic() + _TRIED_S  # if the connection ends before that, it shows no limits
+        tried_at = time.monotonic() + _TRIED_S  # only a connection that lasts so long shows the limits
         try:
             self._synchronize(connection, run.stopping)
             if earlier_failures := self._dialler.addresses.succeeded():
@@ -307,7 +307,7 @@ class MqttTransport(Transport):
         self._dialler.stalled = False
 
     def _query_own(self, connection: Connection, stopping: threading.Event) -> set[str]:
-        """Return the topics of our retained messages that are not sent again: the broker has ours, or rightly another.
+        """Return the topics of our retained messages that are not sent again: the broker has ours, or may have another.
 
         Sets ``went_back`` if it has another value on a topic that only we publish on: an older one. All values have
         arrived when a ping is answered, because they have QoS 0.
@@ -316,7 +316,7 @@ class MqttTransport(Transport):
         with self._publishing:
             messages = {topic: message for topic, message in self._own.items() if topic not in self._own.pending}
             not_accepted = {topic for topic, message in messages.items() if not self._accepts(connection, message)}
-            may_differ = self._own.shared | not_accepted  # others publish there, or ours is refused
+            may_differ = self._own.shared | not_accepted  # there it may: others publish, too, or ours is refused
         retained = self._find(connection, list(messages), stopping)
         if self.will is not None and retained.get(self.will.topic) == self.will.payload:
             del retained[self.will.topic]  # our own will, published although we were running
@@ -379,13 +379,13 @@ class MqttTransport(Transport):
             for subscription in subscriptions.matched.get(message.topic) or subscriptions.matching(message.topic):
                 subscription.offer(message, repeat=repeat)
 
-    def note_answers(self, refused: Mapping[str, bool]) -> None:
+    def note_answers(self, refused: Mapping[str, bool]) -> None:  # see Owner: by filter, True if it is refused
         if self._connection is None:
             return  # these answer `_find`, which asks before the connection is used
         subscriptions = list(self._subscriptions)
         for filter_, is_refused in refused.items():
             for subscription in subscriptions:
-                if overlap(subscription.filter, filter_):  # no filter of the broker does but the one that covers it
+                if overlap(subscription.filter, filter_):  # of the broker's filters only the one that covers it does
                     subscription.refused = is_refused
 
     def note_refusal(self, topic: str, why: str) -> None:

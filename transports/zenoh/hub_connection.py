@@ -99,7 +99,7 @@ class HubConnection:
             answered.wait(max(0.0, end - time.monotonic()))
 
     def _query(self, session: zenoh.Session, subscription: Subscription, counts: dict[str, int]) -> threading.Event:
-        """Ask for one subscription's retained messages, see :meth:`fetch`; return an event set at the answer's end."""
+        """Ask for one subscription's retained messages; return an event set at their end. ``counts``: see `fetch`."""
         connection, answered = self._connection, threading.Event()
 
         def take(reply: zenoh.Reply) -> None:

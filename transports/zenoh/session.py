@@ -110,8 +110,8 @@ def _config(settings: ZenohSettings, mode: str, listen: list[Path], connect: lis
         "mode": mode,
         "listen": {"endpoints": [*map(unix_endpoint, listen), *map(_numbered, settings.listen)]},
         "connect": {"endpoints": [*map(unix_endpoint, connect), *map(_numbered, settings.connect)], "retry": _RETRY},
-        # How long a router or peer waits for scouting before open() returns; 500 ms by default.
-        # Gossip would announce our unix sockets to programs connected by TLS: two connected robots of one machine had
+        # delay: how long a router or peer waits for scouting before open() returns, in ms; by default 500.
+        # gossip: it would announce our unix sockets to programs connected by TLS: two connected robots of a machine had
         # all their processes connect to each other, without TLS. Each process finds its siblings without it.
         "scouting": {"delay": 1, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "timestamping": {"enabled": False},  # the order of arrival at the hub decides, never a clock
@@ -131,11 +131,11 @@ def _config(settings: ZenohSettings, mode: str, listen: list[Path], connect: lis
 
 def _check_endpoint(name: str, endpoint: str, tls: TlsSettings | None) -> None:
     if endpoint.startswith(_LOOPBACK):
-        return
+        return  # it stays on this machine
     if not endpoint.startswith(_SAFE_SCHEMES):
         raise TransportError(f"transport.{name}: {endpoint} leaves this machine unencrypted: use tls/host:port")
     if not endpoint.startswith(_TLS_SCHEMES):
-        return
+        return  # a Unix socket
     if tls is None:
         raise TransportError(f"transport.{name}: {endpoint} needs transport.tls")
     if name == "listen" and tls.ca_cert is None:

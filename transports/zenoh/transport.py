@@ -29,7 +29,7 @@ from pebble.transports.zenoh.callbacks import direct
 from pebble.transports.zenoh.hub_connection import GOODBYE_S, HUB_ANSWER_S, HubConnection
 from pebble.transports.zenoh.keymap import filter_to_key, key_to_topic
 from pebble.transports.zenoh.loopback_queue import LoopbackQueue
-from pebble.transports.zenoh.presence import Barrier, HubView
+from pebble.transports.zenoh.presence import Barrier, HubView, HubWatch
 from pebble.transports.zenoh.publishers import Publishers
 
 log = logging.getLogger(__name__)
@@ -75,7 +75,8 @@ class ZenohTransport(Transport):
         self.problem = f"no hub answers in {self.settings.run_dir}: {_START}"
         if not self.settings.client:
             self._start_peer()
-        self._thread = threading.Thread(target=self._run, name=f"pebble-zenoh {self.client_id}", daemon=True)
+        name = f"pebble-zenoh {self.client_id}"
+        self._thread = threading.Thread(target=self._run, args=(self._hub.watch,), name=name, daemon=True)
         self._thread.start()
         sessions.close_at_exit(self)
         self._opened.wait(min(timeout, OPEN_SYNC_S))  # for the siblings; the caller waits for the hub
@@ -90,31 +91,31 @@ class ZenohTransport(Transport):
         except (zenoh.ZError, TransportError) as error:
             presence.release()
             raise TransportError(f"zenoh session of {self.client_id}: {error}") from None
-        if self._begin(session, presence.name):  # False: closed meanwhile
+        if self._begin(self._hub.watch, session, presence.name):  # False: closed meanwhile
             presence.ready()
 
-    def _start_client(self) -> bool:
+    def _start_client(self, watch: HubWatch) -> bool:
         """Try until a hub answers, without which a session in client mode cannot open; True if it has opened."""
         account = self.settings.account
         hub = [] if self.settings.connect else [self.settings.run_dir / sessions.HUB_SOCKET]
         config = sessions.session_config(self.settings, "client", listen=[], connect=hub)
-        while not self._hub.watch.closed:
+        while not watch.closed:
             try:
                 session = sessions.open_session(config)
             except zenoh.ZError as error:
                 log.debug("%s: %s", self.client_id, error)
                 hubs = ", ".join(self.settings.connect) or self.settings.run_dir / sessions.HUB_SOCKET
                 self.problem = f"no hub answers at {hubs}: {_START}"
-                self._hub.watch.wait_closed(_RETRY_S)
+                watch.wait_closed(_RETRY_S)
                 continue
-            if self._begin(session, f"{account}{wire.OF}{new_name()}" if account else new_name()):
+            if self._begin(watch, session, f"{account}{wire.OF}{new_name()}" if account else new_name()):
                 return True
         return False
 
-    def _begin(self, session: zenoh.Session, name: str) -> bool:
+    def _begin(self, watch: HubWatch, session: zenoh.Session, name: str) -> bool:
         """Use ``session`` from now on: subscribe, and watch its hubs. False if this transport was closed meanwhile."""
         with self._hub.lock:
-            if self._hub.watch.closed:
+            if watch.closed:
                 sessions.close_session(session)
                 return False
             self._hub.name, self.session = name, session
@@ -122,8 +123,8 @@ class ZenohTransport(Transport):
         self._barrier = Barrier(session, name, lambda: self._hub.retained_count, by_name=self._elsewhere)
         with self._connecting:
             for subscription in self._subscriptions:
-                self._start(session, subscription)
-        self._hub.watch.follow(session)
+                self._make_subscriber(session, subscription)
+        watch.follow(session)
         return True
 
     def _close(self, will: Message | None) -> None:
@@ -154,22 +155,22 @@ class ZenohTransport(Transport):
 
     # -- the transport's thread: every time a hub appears a new connection begins
 
-    def _run(self) -> None:
-        if self.settings.client and not self._start_client():
+    def _run(self, watch: HubWatch) -> None:
+        """Follow ``watch``, which is closed at the end of this run, and replaced when the transport opens again."""
+        if self.settings.client and not self._start_client(watch):
             return
         version = 0  # of the newest HubView (which hubs are present) that was handled
         linked = 0  # the number of the hub connection that works; 0: none does, and with a hub it is tried again
         self._wait_for_siblings_once()
-        watch = self._hub.watch  # of this run: it is closed at the end, and replaced when the transport opens again
         while (view := watch.wait(version, _RETRY_S if watch.hubs and not linked else None)) is not None:
             try:
                 linked = self._follow(view, version, linked)
             except Exception:  # any error must lead to a reconnect, never end the thread
-                if self._hub.watch.closed:  # the transport is being closed, which may be why
+                if watch.closed:  # the transport is being closed, which may be why
                     return
                 log.exception("%s: unexpected failure of the connection to the hub", self.client_id)
                 linked = 0
-                self._hub.watch.wait_closed(HUB_ANSWER_S)
+                watch.wait_closed(HUB_ANSWER_S)
             version = view.version
 
     def _synchronize(self, timeout: float) -> dict[str, int]:
@@ -179,10 +180,10 @@ class ZenohTransport(Transport):
         counts, `HubConnection.fetch` lets the hub answer only after these. Siblings on other machines (`_elsewhere`)
         are in no run directory here, so only the hub is waited for.
         """
-        if self._barrier is None:
+        if self._barrier is None:  # no session has begun
             return {}
 
-        def expected() -> dict[str, str]:
+        def expected() -> dict[str, str]:  # by name: what each is, for logs
             siblings = {} if self._elsewhere else self._siblings.ready(but=self._hub.name)
             return siblings | dict.fromkeys(self._hub.watch.hubs, "the hub")
 
@@ -233,7 +234,7 @@ class ZenohTransport(Transport):
             lacking = self._hub.greet(session, hello, remaining_s)
             if lacking is None:
                 return False
-            if not self._send_lacking(session, lacking - sent):  # the hub has all, or no room for what was sent before
+            if not self._send_lacking(session, lacking - sent):  # nothing left: the hub has all, or no room for `sent`
                 return True
             sent |= lacking
         return False
@@ -246,7 +247,7 @@ class ZenohTransport(Transport):
         with self._publishing:
             owed = bool(self._own.pending or lacking)
             self._sync_retained(self._own.keys() - lacking)  # sends all but these
-            self._hub.put_removals(session, lacking)  # or it may lack their removals
+            self._hub.put_removals(session, lacking)  # what the hub lacks may also be the removal of a message
             return owed
 
     def _refresh(self) -> None:
@@ -257,7 +258,7 @@ class ZenohTransport(Transport):
             with self._hub.lock:
                 self._hub.renew()  # answers to earlier queries are dropped
                 self._renew()  # all subscriptions: retained messages are delivered again
-            counts = self._synchronize(SYNC_S)  # after _renew: messages received live meanwhile are newer
+            counts = self._synchronize(SYNC_S)  # after _renew: a retained one is dropped if a live one comes first
             self._hub.fetch(self.session, list(self._subscribers), counts)
 
     # -- sending
@@ -295,7 +296,7 @@ class ZenohTransport(Transport):
                 return  # they are declared when there is a session
             with contextlib.suppress(zenoh.ZError):  # closed meanwhile: then nothing is received any more
                 for subscription in subscriptions:
-                    self._start(session, subscription)
+                    self._make_subscriber(session, subscription)
                 counts = self._synchronize(SYNC_S)
                 if self._state is State.CONNECTED:
                     self._hub.fetch(session, subscriptions, counts)
@@ -306,7 +307,7 @@ class ZenohTransport(Transport):
             with contextlib.suppress(zenoh.ZError):  # closed meanwhile
                 subscriber.undeclare()  # type: ignore[no-untyped-call]
 
-    def _start(self, session: zenoh.Session, subscription: Subscription) -> None:
+    def _make_subscriber(self, session: zenoh.Session, subscription: Subscription) -> None:
         if subscription in self._subscribers:
             return
         origin = zenoh.Locality.ANY if subscription.echo else zenoh.Locality.REMOTE
@@ -318,7 +319,7 @@ class ZenohTransport(Transport):
             self.count_received()
             read_at = clock.since_boot()
             stamp = wire.read_live(sample.attachment)
-            # A sender of the same boot shares our clock: its age counts from the sending. Most need no second look.
+            # A sender of this boot shares our clock: the age is known. Only if it is high, or unknown, ask `_is_late`.
             since = stamp.sent_ns / 1e9 if stamp.boot == wire.BOOT else None
             if (since is None or read_at - since > late_s) and self._is_late(sample, stamp, read_at):
                 return

@@ -51,7 +51,7 @@ def brokers(connections: Iterable[tuple[Path, Section]]) -> Iterator[tuple[Path,
 def connections(root: Root) -> Iterator[tuple[Path, Section]]:
     """Yield all sections of connections in use, those of extensions included, with their places in the config."""
     yield from core_connections(root)
-    for place, holder in {("services",): root.services, (): root}.items():
+    for place, holder in ((("services",), root.services), ((), root)):
         for name in holder.__struct_fields__:
             section = getattr(holder, name)
             if isinstance(section, Section):

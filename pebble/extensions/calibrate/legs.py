@@ -96,7 +96,7 @@ class Legs:
     def spin(self, name: str, turns: int) -> Counts:
         """Spin ``turns`` on the spot; negative is clockwise. With a tag, the spin ends where it is seen as before."""
         way_mm = abs(turns) * math.pi * self._expected.track_width_mm  # of each wheel
-        side = -math.copysign(1.0, turns)
+        side = -math.copysign(1.0, turns)  # as drive commands have it: positive turns to the right
         fast_mm = way_mm if self._finder is None else way_mm * _BEFORE_TAG
 
         def ends(counts: Counts) -> bool:
@@ -109,7 +109,7 @@ class Legs:
         self._drive(name, (side * POWER, 0.0), way_mm / self._mm_s, ends)
         if start is not None:
             slow_mm_s = self._mm_s * _SLOW_POWER / POWER
-            slow_s = way_mm / abs(turns) / slow_mm_s  # for a whole turn
+            slow_s = way_mm / abs(turns) / slow_mm_s  # that a whole turn takes
             why_late = f"it does not see tag {self._tag_id} again"
             for direction in (side, -side):  # back, if it has rolled past
                 self._drive(name, (direction * _SLOW_POWER, 0.0), slow_s, lambda _: self._is_at(start), why_late)

@@ -60,7 +60,7 @@ def calibrate(robot: Robot, person: Person, wanted: Wanted, clock: Callable[[], 
     """Drive all runs, fit the wheels, and write ``odometry.json`` beside the config. Raises PebbleError, Stopped."""
     check(wanted)
     path = robot.config.folder / CALIBRATION
-    write(path.with_suffix(".try"), b"", 0o644, PebbleError)  # now, not after all runs
+    write(path.with_suffix(".try"), b"", 0o644, PebbleError)  # raises before the runs if nothing can be written there
     path.with_suffix(".try").unlink()
     session = _Session(robot, person, wanted, clock)
     result = session.run()
@@ -98,7 +98,7 @@ class _Session:
             camera = CameraModel.find([robot.config.folder])
             self._legs.watch(TagFinder(wanted.tag_size_m, camera, wanted.family), wanted.tag)
         kinds = [self._straight] * wanted.straights + [self._spin] * wanted.spins
-        #: What drives each run, and its sign: there or left, then back or right.
+        #: The method of each run, and its sign, in turns: 1 (there, or left), -1 (back, or right). Straights are even.
         self._drives = [(drive, 1 if number % 2 == 0 else -1) for number, drive in enumerate(kinds)]
         self.runs: list[Run] = []
 
@@ -231,7 +231,7 @@ def between(start: Place, end: Place) -> _Movement:
     """Return the movement of a robot that drove an arc, by the places of one tag as seen from its start and its end."""
     before_mm, before_rad = _on_floor_mm(start), start.angle_rad
     after_mm, after_rad = _on_floor_mm(end), end.angle_rad
-    # The chord is half of the turn away from both headings. The tag is equally far beside it at the start and the end:
+    # Both headings differ from the chord's by half of the turn. The tag's distance beside the chord does not change, so
     # before_mm * sin(before_rad + half_turn) == after_mm * sin(after_rad - half_turn).
     half_turn = math.atan2(
         after_mm * math.sin(after_rad) - before_mm * math.sin(before_rad),

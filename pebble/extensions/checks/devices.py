@@ -68,7 +68,7 @@ def camera(backend: str, name: str, folder: Path) -> CheckResult:
     if "://" in name:
         return ok("on the network: not checked")
     path = folder / f"video{name}" if name.isdecimal() else Path(name)
-    return device(path, "it", _CAMERA, folder / "v4l")
+    return device(path, what="it", key=_CAMERA, names=folder / "v4l")
 
 
 def microphone(config: Config) -> Iterator[CheckResult]:

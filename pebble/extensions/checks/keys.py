@@ -69,10 +69,11 @@ def _allowed(field: FieldInfo) -> str:
         return " A list."
     if get_origin(kind) is dict:
         return " An object."
-    has_limits = any(set(meta.extra or ()) - {"parse"} for meta in metas)  # "parse" is a function, not a limit
-    if kind in (bool, str) and not has_limits:
+    # What else is said of the values, such as "choices" and "expected"; "parse" is a function that reads them.
+    limits = [name for meta in metas for name in meta.extra or () if name != "parse"]
+    if kind in (bool, str) and not limits:
         return ""
-    text = expected(kind, metas).partition(":")[0]  # of "a topic: 1 to 250 …" the first two words
+    text = expected(kind, metas).partition(":")[0]  # of "a topic: 1 to 250 …" only "a topic"
     return f" {text[:1].upper()}{text[1:]}."
 
 

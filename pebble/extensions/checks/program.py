@@ -20,7 +20,8 @@ class Finished(NamedTuple):
 def run(command: Sequence[str], timeout_s: float, *, stderr: int | None = None, **options: Any) -> Finished:
     """Run a program until it ends, even if children that it leaves behind keep its output open.
 
-    ``options``: more options of subprocess. Raises OSError and, after killing the program, subprocess.TimeoutExpired.
+    ``stderr``: as for subprocess, such as STDOUT; None: into ``errors``. ``options``: more options of subprocess.
+    Raises OSError and, after killing the program, subprocess.TimeoutExpired.
     """
     nothing = subprocess.DEVNULL
     with _file() as output, _file() as errors:
@@ -28,7 +29,7 @@ def run(command: Sequence[str], timeout_s: float, *, stderr: int | None = None, 
         done = subprocess.run(
             command, stdin=nothing, stdout=output, stderr=to, timeout=timeout_s, check=False, **options
         )
-        return Finished(done.returncode, _end(output), _end(errors))
+        return Finished(done.returncode, _last_part(output), _last_part(errors))
 
 
 def _file() -> IO[bytes]:
@@ -36,6 +37,6 @@ def _file() -> IO[bytes]:
     return os.fdopen(os.memfd_create("output"), "w+b") if hasattr(os, "memfd_create") else TemporaryFile()
 
 
-def _end(file: IO[bytes]) -> str:
+def _last_part(file: IO[bytes]) -> str:
     file.seek(max(0, file.seek(0, os.SEEK_END) - _LONGEST))
     return file.read().decode(errors="replace")

@@ -48,9 +48,9 @@ def write_conf(folder: Path, fleet: Fleet) -> None:
 
 
 def conf_differences(folder: Path, fleet: Fleet) -> Iterator[str]:
-    """Yield each line of `mosquitto.conf` that :func:`write_conf` has not written: it may open another listener.
+    """Yield in words each line of `mosquitto.conf` that :func:`write_conf` would not write, and each that it lacks.
 
-    Such a line may have a reason, so no command removes it.
+    A line too many may open another listener, or may have a reason, so no command removes it.
     """
     file = folder / CONF
     try:

@@ -76,7 +76,7 @@ class CheckedNames(Names):
             if channel is None or not (channel.suffix in self._strangers or _is_zero(channel, payload)):
                 return Drop.UNNAMED  # a drive command that only stops passes without a right
         elif (message.retain or message.retain_requested) and payload_type is not EstopCommand:
-            return Drop.STALE  # a flag, too: with a name it is a command
+            return Drop.STALE  # also a flag: with a name it is a command; its value is retained on the plain topic
         if channel is GROUP and not _is_group(payload):  # several commands in one payload
             return Drop.UNREADABLE
         fields, by = _object(payload), account  # by: the checked sender, in place of a claim

@@ -102,9 +102,10 @@ class Audit(Observer):
             with suppress(PayloadError):
                 for member in groups.decode(payload):
                     self.passed(member.channel, by, member.payload)
+            return  # the group itself has no row
         row_of = _COMMANDS.get(channel.suffix)
         if row_of is None and channel.kind not in (Kind.FLAG, Kind.ACTION):
-            return  # a group, too: only its members have rows
+            return
         with suppress(PayloadError):
             if row_of is not None:
                 command = codec.decode(channel, payload)
@@ -134,13 +135,14 @@ class Audit(Observer):
             return
         for what, holder in (("control-ended", before), ("control-given", state)):
             if holder.key:
-                who = holder.by if holder.named and holder.by else f"{holder.by}{_UNCHECKED}"
+                who = holder.by if holder.named and holder.by else f"{holder.by}{_UNCHECKED}"  # "?": no name
                 self.note(what, who, id=holder.id, device=holder.device)
 
     def estop(self, owner: str, state: EstopState) -> None:
         """Add a row if the owner has refused a reset; its state shows only why it has refused the last one."""
-        why, before = state.reset_refused, self._refusals.get(owner, state.reset_refused)
-        is_answer = owner in self._awaited
+        why = state.reset_refused
+        before = self._refusals.get(owner, why)  # the first state that is seen may tell of an old refusal
+        is_answer = owner in self._awaited  # to the newest reset that passed here
         is_of_another = why == "boot" and len(self._owners) > 1  # a reset is for one owner's boot: all others refuse it
         self._refusals[owner] = why
         self._awaited.discard(owner)

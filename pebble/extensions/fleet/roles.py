@@ -236,7 +236,7 @@ def _of_bases(name: str, account: Account, *, at_hub: bool) -> Iterator[Rule]:
                 yield from _of_neighbour(base)
         elif ProgramRole.BOARDS in roles and at_hub:
             continue  # no rule, as the robots that it carries are at a broker
-        elif ProgramRole.BOARDS in roles or ProgramRole.ROBOT in roles:
+        elif ProgramRole.BOARDS in roles or ProgramRole.ROBOT in roles:  # BOARDS: at the broker of the operators
             yield from (Rule(access, f"{base}/#") for access in ("read", "write"))
             if ProgramRole.ROBOT in roles and not at_hub:
                 yield Rule("write", f"{c.SHORT}{name}")  # a short topic for groups of streams on a thin link
@@ -301,7 +301,7 @@ def _of_rights(
                 yield Rule("write", f"{_ANY}/{INCOMING}/{BY}/{name}/{metric}")
             for base in bases_without_names:
                 yield Rule("write", f"{base}/{INCOMING}/{metric}")
-    if Right.DRIVE in held:  # as a page server, whose account `pebble doctor` checks by probes, which programs ignore
+    if Right.DRIVE in held:  # `pebble doctor` checks a page server's account by a probe here, which no program reads
         yield Rule("write", c.BRIDGE_PROBE.filter(f"+/{SERVERS}/+"))
     if Right.EXPAND in held:
         yield from _of_expander()

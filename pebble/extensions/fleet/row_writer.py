@@ -11,7 +11,9 @@ from pebble.errors import PebbleError
 log = logging.getLogger(__name__)
 
 WINDOW_S = 60.0  # of similar rows within it two are stored: the first, and the newest with the number of copies
-DIFFERENT, OF_STRANGERS = 300, 100  # different rows within it; those beyond are counted by their kind
+#: Different rows within it; those beyond are counted by their kind. What comes in any number and matters little (what
+#: strangers are refused, and lights and sounds of anybody) may not fill it: stops and control have the rest.
+DIFFERENT, OF_STRANGERS = 300, 100
 WAITING = 1000  # rows that are not stored yet
 _ROUND_S = 10.0  # between two looks at what was counted, and two tries at a disk that takes nothing
 _END_S = 3.0  # longest wait for the last rows

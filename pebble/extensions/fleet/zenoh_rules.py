@@ -28,13 +28,13 @@ _FLAGS = tuple(f"/{channel.suffix}" for channel in CHANNELS if channel.kind is K
 def zenoh_text(fleet: Fleet) -> bytes:
     """Return the file that a hub reads as ``transport.access``."""
     rules = {name: fleet.rules_of(name, at_hub=True) for name in fleet.accounts}
-    accounts = {name: _hub_account(fleet.accounts[name], its_rules) for name, its_rules in rules.items()}
-    grants = (
-        ([name], _grants(name, rules[name], accounts[name].retains, is_hub=ProgramRole.HUB in account.roles))
+    hub_accounts = {name: _hub_account(fleet.accounts[name], its_rules) for name, its_rules in rules.items()}
+    grants = (  # rows of access_control: names in certificates, and what these may do
+        ([name], _grants(name, rules[name], hub_accounts[name].retains, is_hub=ProgramRole.HUB in account.roles))
         for name, account in fleet.accounts.items()
     )
     commands, stops = _keys([f"{_ANY}/{INCOMING}/#"]), _keys((_STOP, with_name(_STOP, "+")))
-    return written(Access(access_control(grants), accounts, priorities(commands, stops)))
+    return written(Access(access_control(grants), hub_accounts, priorities(commands, stops)))
 
 
 def _hub_account(account: Account, held: Iterable[Rule]) -> HubAccount:
@@ -46,7 +46,7 @@ def _hub_account(account: Account, held: Iterable[Rule]) -> HubAccount:
     writes = [rule.filter for rule in held if rule.access == "write"]
     is_robot = ProgramRole.ROBOT in account.roles
     wills = [f"{base}/{OUTGOING}/#" for base in account.bases if is_robot]
-    all_topics = [filter_ for filter_ in writes if is_robot and filter_.endswith("/#")]  # so do all of a robot's rules
+    all_topics = [filter_ for filter_ in writes if is_robot and filter_.endswith("/#")]  # a robot's rule: {base}/#
     flags = [filter_ for filter_ in writes if filter_.endswith(_FLAGS)]
     return HubAccount(tuple(wills), tuple(dict.fromkeys((*wills, *all_topics, *flags))))
 

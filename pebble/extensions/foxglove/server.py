@@ -57,10 +57,10 @@ class Server:
         self._sdk = _sdk()
         self._context = self._sdk.Context()
         self._server: WebSocketServer | None = None
-        self._channels: dict[str, foxglove.Channel] = {}
+        self._channels: dict[str, foxglove.Channel] = {}  # by topic
         self._lock = threading.Lock()  # guards what follows
-        self._subscribers: dict[str, set[int]] = {}
-        self._remembered: dict[str, _Remembered] = {}
+        self._subscribers: dict[str, set[int]] = {}  # by topic: ids of clients
+        self._remembered: dict[str, _Remembered] = {}  # by topic: the last message, for later subscribers
         self._remembered_bytes = 0
 
     def start(self, host: str, port: int) -> str:

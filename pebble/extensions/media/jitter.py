@@ -224,7 +224,7 @@ class JitterBuffer:
         if received is None:
             return self._conceal(self._budget_s)
         samples = received.samples
-        # Opus decodes on from its own estimate; that of pcm repeats the last packet, and ends anywhere in it.
+        # Opus goes on smoothly from its own estimate. For pcm the last packet is repeated, and breaks off anywhere.
         if self._concealed and self._last is not None and received.encoding == "pcm":
             samples = _faded_in(samples, received.rate)
         self._last, self._concealed, self._spare = received, 0, None

@@ -84,7 +84,7 @@ class SoundEncoder:
         """Return the PBAT packets that are now complete; ``captured_ms`` is the epoch time of the first sample."""
         packets = []
         if self._intake.has_gap(captured_ms):
-            self._ready = []
+            self._ready = []  # from before the gap: a packet has one time stamp
         for frame, first_ms in self._intake.frames(pcm, captured_ms, self._samples):
             if not self._ready:
                 self._ready_ms = first_ms
@@ -195,7 +195,7 @@ class SoundDecoder:
 
     def __init__(self) -> None:
         self.counters = Counters()
-        self._format = (0, 0, 0)
+        self._format = (0, 0, 0)  # codec, rate and channels of the last packet
         self._opus: OpusDecoder | None = None
 
     def feed(self, payload: bytes) -> ReceivedSound | None:

@@ -33,7 +33,8 @@ def exporter(
     """
     host = host_of("--host", host)
     token = "" if token_file is None else read_password(token_file, "--token-file")
-    if not token and (token_file is not None or not is_loopback(host)):
+    needs_token = token_file is not None or not is_loopback(host)  # a file that is given must not be empty
+    if needs_token and not token:
         raise PebbleError(f"--host {host}: others could read everything: add --token-file FILE, with a token in it")
     _, settings, _, where = resolve(Target(url=url, password_file=password_file, ca_cert=ca_cert))
     if not isinstance(settings, MqttSettings):

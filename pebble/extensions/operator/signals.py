@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from types import FrameType
 from typing import TYPE_CHECKING, Any
+
+import typer
 
 from pebble.runtime.signals import ending_signals
 
@@ -49,11 +51,12 @@ def _end(_signal: int, _frame: FrameType | None) -> None:
 
 @contextmanager
 def until_ended() -> Iterator[None]:
-    """Leave the block on SIGTERM, as commands do that run until they are ended. In the main thread only."""
+    """End the command with exit code 0 on SIGTERM, as it runs until it is ended. In the main thread only."""
     before = signal.signal(signal.SIGTERM, _end)
     try:
-        with suppress(_EndedError):
-            yield
+        yield
+    except _EndedError:
+        raise typer.Exit from None
     finally:
         signal.signal(signal.SIGTERM, before)
 

@@ -131,7 +131,7 @@ class Control:
         if "drive" in self._rights():
             server.drivers.restore(hello.token, self._tab)
         server.robots.join(self._interest)
-        self._interest.dirty |= {(ref, "web/driver") for ref in server.robots.components}  # `join` has none, see _flush
+        self._interest.dirty |= {(ref, "web/driver") for ref in server.robots.components}  # not by `join`: see _flush
         self._post(self._ping())
 
     def _end(self) -> None:
@@ -370,14 +370,14 @@ class Control:
         while self._waiting:
             await self._websocket.send_text(encode(self._waiting.popleft()))
         # Each page is shown the driver in another way, so the table of robots does not have this value.
-        drivers = {(ref, metric) for ref, metric in self._interest.dirty if metric == "web/driver"}
-        self._interest.dirty -= drivers
+        driven = [ref for ref, metric in self._interest.dirty if metric == "web/driver"]
+        self._interest.dirty -= {(ref, "web/driver") for ref in driven}
         changed, has_large = self._server.robots.take(self._interest, now, large=self._may_send_large)
         if has_large:
             self._may_send_large = False
         if self._interest.more:
             self._wake.set()
-        values = changed + tuple((ref, "web/driver", self._driver(ref), 0.0) for ref, _ in drivers)
+        values = changed + tuple((ref, "web/driver", self._driver(ref), 0.0) for ref in driven)  # 0.0: their age
         removed, self._interest.gone = tuple(self._interest.gone), set()
         if values or removed:
             await self._websocket.send_text(encode(m.State(now=1000 * time.time(), set=values, gone=removed)))

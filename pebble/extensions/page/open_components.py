@@ -145,7 +145,7 @@ class OpenComponents:
         def take(message: Message, now: float) -> None:
             meaning = self._wanted.get(ref, {}).get(filter_)
             aliases_before = self._robots.aliases(ref)
-            if meaning is None:
+            if meaning is None:  # the topic's name shows component and channel
                 self._robots.receive(message, now)
             elif meaning.channel.kind is c.Kind.FLAG:
                 self._receive_flag(ref, meaning.channel, message)
@@ -174,7 +174,7 @@ class OpenComponents:
 
         A topic that has a meaning keeps it, unless it is that of a flag.
         """
-        filters: _Filters = {channel.filter(ref): None for channel in WATCHED}
+        filters: _Filters = {channel.filter(ref): None for channel in WATCHED}  # None: the names tell the meaning
         for channel in _NAMED:
             self._add(filters, ref, channel)
         for metric in self._robots.aliases(ref):

@@ -57,7 +57,7 @@ def refusal(op: m.RobotOp, capabilities: dict[str, Any]) -> str:
     if isinstance(op, m.McuOp) and op.name == _DESCRIBE:
         return f"{op.name} is no command of a microcontroller"
     command = _command(op)
-    section, key = PLACES.get(command.channel, ("", ""))
+    section, key = PLACES.get(command.channel, ("", ""))  # where the capabilities may name its topic
     if isinstance(op, m.ActionOp):
         described = (section_of(capabilities, section) for section in _sections(op))
         offer = next(filter(None, described), {})
@@ -65,7 +65,7 @@ def refusal(op: m.RobotOp, capabilities: dict[str, Any]) -> str:
         offer = _outlet_offer(capabilities, op.outlet)
     else:
         offer = section_of(capabilities, section)
-    # Lights that do not flash have {"solid": true, "flash": false}: the key is that of the topic, "flash_topic".
+    # The section of lights that do not flash has "flash": false, a key like that of the topic, "flash_topic".
     refusing_keys = ("available", "controls", key.removesuffix("_topic"))
     if not any(offer.get(refusing_key) is False for refusing_key in refusing_keys):
         return ""
@@ -88,7 +88,7 @@ def publication(op: m.RobotOp, capabilities: dict[str, Any]) -> Message:
     channel = command.channel
     if isinstance(op, m.ActionOp):
         topic = _action_topic(op, channel, capabilities)
-    elif channel in PLACES:
+    elif channel in PLACES:  # the capabilities may name its topic
         topic = topic_of(op.ref, capabilities, channel)
     else:
         topic = channel.topic(op.ref, **command.names)

@@ -385,7 +385,7 @@ def _channel(metric: str) -> c.Channel | None:
 
 
 def _aliases(payload: bytes) -> tuple[str, ...]:
-    """Return the metrics that a manifest declares beyond the contract; the rest of it may be invalid."""
+    """Return an MCU's aliases, the metrics of its values besides ``mcu/…``; the rest of its manifest may be invalid."""
     manifest = codec.plain(c.MCU_DESCRIBE, payload)
     interfaces = manifest.get("interfaces") if isinstance(manifest, dict) else None
     metrics: list[str] = []
@@ -398,7 +398,7 @@ def _aliases(payload: bytes) -> tuple[str, ...]:
 
 
 def _may_be_alias(metric: str) -> bool:
-    """True if a manifest may declare this metric: neither the contract nor the server itself defines it."""
+    """True if this metric may be an alias (see `_aliases`): neither the contract nor the server itself defines it."""
     family = metric.partition("/")[0]
     return (
         _channel(metric) is None

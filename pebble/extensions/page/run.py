@@ -38,13 +38,13 @@ def main(arguments: list[str]) -> int:
 def settings_or_all_problems(config: Config) -> WebSettings:
     """Return the settings of the page. Raises ConfigError.
 
-    The error names all problems at once, also a missing user.
+    The error names all problems at once, also a missing user. That alone is no error here: callers look for users.
     """
     try:
         return settings_of(config)
     except ConfigError as error:
         try:
-            missing_user = _without_user(config)
+            missing_user = _problem_of_users(config)
         except PebbleError as other:
             missing_user = [str(other)]
         raise ConfigError([*error.problems, *missing_user]) from None
@@ -55,12 +55,12 @@ def _settings_of_process(path: str) -> WebSettings:
     config = config_of_process(path)
     set_log_level(config.log_level)
     settings = settings_or_all_problems(config)
-    if problems := _without_user(config):
+    if problems := _problem_of_users(config):
         raise ConfigError(problems)
     return settings
 
 
-def _without_user(config: Config) -> list[str]:
+def _problem_of_users(config: Config) -> list[str]:
     """Return the problem that a login is needed and no user exists; empty if there is none."""
     file = people_of(config)
     if not has_login(config.section(WebInterface)) or has_user(file):

@@ -166,7 +166,7 @@ class Server:
         return self.stop_broker.publish(topic, payload, qos=qos) or self.broker.publish(topic, payload, qos=qos)
 
     def _stop_by_heartbeats(self, now: float) -> None:
-        """During a stop of all, stop robots whose heartbeats arrive on the heartbeats' own connection."""
+        """During a stop of all, also stop robots that Heartbeats finds, a connection that receives nothing else."""
         if self._heartbeats is None:
             if self.stops.collecting:
                 self._heartbeats = Heartbeats(in_small_segments(self.settings.broker))

@@ -224,7 +224,7 @@ def _capabilities(payload: Any) -> Any:
         return {}
     valid = {name: section for name, section in value.items() if _is(_SECTIONS.get(name, Any), section)}
     is_wrapped = value is not payload
-    return payload if is_wrapped and valid == value else {"value": valid}
+    return payload if is_wrapped and valid == value else {"value": valid}  # pages always get it as "value"
 
 
 _SHOWN: dict[str, Callable[[Any], Any]] = {

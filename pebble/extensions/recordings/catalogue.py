@@ -146,7 +146,7 @@ def check_names(query: Query, paths: Iterable[Path], places: Iterable[Path]) -> 
         except RecordingError:
             return
     robots = robots_of(channels)
-    if query.robot not in [*map(composed, robots)]:
+    if query.robot not in [*map(composed, robots)]:  # check_name lets None pass
         check_name("robot", query.robot, robots, places)
     topics = {channel.topic for channel in channels if query.robot is None or is_of(channel.topic, query.robot)}
     for filter_ in query.topics:

@@ -53,7 +53,7 @@ class Expander:
         self.id = id_ or secrets.token_hex(4)
         self.counts: Counter[str] = Counter()
         self._transport, self._clock = transport, clock
-        self._robots: dict[str, _Robot] = {}
+        self._robots: dict[str, _Robot] = {}  # by base topic; `_Robot` explains its times
         self._number, self._sent_at = 0, dict[int, float]()  # of the newest announcement; by number, when it was sent
         self._lock = threading.RLock()
 
@@ -160,6 +160,7 @@ class Expander:
             return
         for metric, payload in streams.items():
             channel = channel_of(f"{OUTGOING}/{metric}")
+            # A metric that the contract does not know passes as well, unless only the robot itself may define it.
             may_pass = not is_reserved(metric) if channel is None else is_stream(channel)
             if may_pass:
                 qos = QoS.LATEST if channel is None else QoS(channel.default_qos)

@@ -73,6 +73,7 @@ class Crowd:
         self._contrary_since: float | None = None  # when measurements began to contradict ``stands``
 
     def note(self, queue_s: float, now: float) -> None:
+        """Note how much longer answers take than the fastest; after contradicting it for a time, change ``stands``."""
         contradicts = queue_s < _DRAINED_S if self.stands else queue_s > _STANDING_S
         if not contradicts:
             self._contrary_since = None
@@ -87,7 +88,7 @@ class LinkMeter:
 
     At `auto` the level depends on the queue: how much longer answers take than the fastest one. The level falls early
     and rises late: after each rise that fails, the time without a queue before the next rise doubles, up to ten
-    minutes.
+    minutes. ``kbit``: the rate of the link in the config, if any; at `auto` a small one makes the level thin for good.
     """
 
     def __init__(self, profile: str, kbit: float | None = None) -> None:
@@ -199,7 +200,7 @@ class Room:
         self._was_full = False
 
     def takes(self, rank: Rank, size: int, now: float) -> bool:
-        """Return True if ``size`` bytes of this rank may be sent now, and note them.
+        """Return True if ``size`` bytes of this rank may be sent now, and note them; with 0 it only asks.
 
         One message may always be on its way; if it is larger than the room, it fills it. Higher ranks may use several
         times the room, so they need not wait for such a message of a lower rank.

@@ -62,7 +62,7 @@ class Sifter:
         Return NO_ROOM for one that is kept, as it is not forwarded yet. For the others return the result of
         :meth:`Forwarder.pass_now`: how it was forwarded, or why not. An expander's announcement stays here.
         """
-        if source.side is not Side.LOCAL or subject.prompt:
+        if source.side is not Side.LOCAL or subject.prompt:  # it enters the robot, or must not wait
             if self._groups is not None and subject.channel is EXPANDER:
                 self._groups.heard(message.payload)  # an announcement for the bridge itself
                 return Drop.STAYS

@@ -74,7 +74,7 @@ class StreamGroups:
         if not self._short:
             return
         self._tries = 0 if self._short_is_heard else self._tries + 1
-        if 1 <= self._tries <= _TRIES:  # with an empty group: its next announcement names the topic then
+        if 1 <= self._tries <= _TRIES:  # an empty group: an expander that hears it will announce so
             self._remote.publish(self._short, b"{}", qos=QoS.LATEST)
         elif self._tries == _TRIES + 1:
             log.warning("no expander hears %s: the broker refuses it, or another robot has it", self._short)

@@ -44,8 +44,8 @@ class LinkReport:
 
     def __init__(self, meter: LinkMeter, address: Address, remote: Transport) -> None:
         self._meter, self._address, self._remote = meter, address, remote
-        self._level, self._crowded, self._queue_s = "", False, 0.0  # as published last
-        self._at = -inf
+        self._level, self._crowded, self._queue_s = "", False, 0.0  # as published last; crowded: a queue stands
+        self._at = -inf  # when that was
 
     @property
     def is_outdated(self) -> bool:
@@ -168,6 +168,7 @@ class ThinUplink(Uplink):
         return self.level.heartbeat_qos if self._saves_acks else None
 
     def heartbeat_due(self) -> bool:
+        """True if a heartbeat is due, and the link has room for it; then it counts as sent."""
         now, level_s = self._clock(), self.level.heartbeat_s  # 0: the level sets no period, only the bridge's timer
         if level_s:
             # This is called every POLL_S: of all calls, the one nearest to the due time counts.

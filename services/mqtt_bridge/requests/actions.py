@@ -1,5 +1,6 @@
 """System actions: reboot, service-restart and git-pull, each a command of the operating system."""
 
+import fcntl
 import logging
 import os
 import threading
@@ -25,7 +26,7 @@ log = logging.getLogger(__name__)
 
 _NEW_FILE: Final = os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_CLOEXEC | os.O_NOFOLLOW
 _MOST, _KEPT = 1 << 20, 1 << 16  # bytes of output: with more the file begins anew with the last ones
-_LOOK_S = 0.2
+LOOK_S = 0.2
 
 
 class Row(Struct, frozen=True):
@@ -83,10 +84,11 @@ class Action:
         import subprocess  # 0.4 MB of every robot's memory, for a command that few robots run
 
         self._log.log("running", logging.WARNING, "%s: running its command", self.name)
-        output, where = None, f"is in {self._output}"
+        output, locked, where = None, None, f"is in {self._output}"
         try:
             self._output.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             output = os.open(self._output, _NEW_FILE, 0o600)
+            locked = _locked(self._output)
         except OSError as error:
             where = f"is lost: {error.strerror}: {self._output}"
         try:
@@ -95,7 +97,7 @@ class Action:
                 cwd=self.control.cwd,
                 env=child_environment(self.control.env),
                 stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL if output is None else output,
+                stdout=subprocess.DEVNULL if locked is None else locked,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,  # a command that restarts this process must survive its end
             )
@@ -104,6 +106,9 @@ class Action:
             if output is not None:
                 os.close(output)
             return False
+        finally:
+            if locked is not None:  # its programs have it
+                os.close(locked)
         arguments, name = (self._process, output, where), f"action {self.name}"
         threading.Thread(target=self._follow, args=arguments, name=name, daemon=True).start()
         return True
@@ -111,17 +116,36 @@ class Action:
     def _follow(self, process: "subprocess.Popen[bytes]", output: int | None, where: str) -> None:
         """Log the command's exit code; limit its output's file until it runs again."""
         while (code := process.poll()) is None:
-            time.sleep(_LOOK_S)
+            time.sleep(LOOK_S)
             if output is not None:
                 shorten(output)
         level = logging.INFO if code == 0 else logging.ERROR
         self._log.log("ended", level, "%s ended with exit code %d, its output %s", self.name, code, where)
         if output is None:
             return
-        while self._process is process:  # programs that it has left behind may write for ever
-            time.sleep(_LOOK_S)
+        in_use = True
+        while in_use and self._process is process:  # programs that it has left behind may write for ever
+            time.sleep(LOOK_S)
+            in_use = _is_locked(output)
             shorten(output)
         os.close(output)
+
+
+def _locked(path: Path) -> int:
+    """Open the file of output for a command: it is locked until all programs that have it from there have ended."""
+    file = os.open(path, _NEW_FILE)
+    with suppress(OSError):  # no file system for locks
+        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    return file
+
+
+def _is_locked(file: int) -> bool:
+    """True if a program may still write to the file."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    return False
 
 
 def shorten(file: int) -> None:

@@ -48,7 +48,7 @@ def keep_stops(config: Config) -> None:
     before = names[-1] if names else config.base
     targets = [config.state_file(f"estop-{owner}") for owner in config.motor_owners]
     for file in _stop_files(config, before):
-        # Under the same name an owner that has a file knows better.
+        # If the robot's name is unchanged, an owner that has a file keeps it: only the others take the stop.
         kept_in = [target for target in targets if before != config.base or not target.exists()]
         saved = _saved(file)
         if file in targets or not kept_in or _is_free(saved):
@@ -70,10 +70,14 @@ def _stop_files(config: Config, base: str) -> list[Path]:
     except FileNotFoundError:
         return []
     except OSError as error:
-        if base == config.base:  # its owners try to read their files, and without them start stopped
+        if base == config.base:  # its owners read them by themselves, and start stopped if they cannot
             return []
         raise PebbleError(f"{folder}: {error.strerror}: stops of {base} may be there, let its user read it") from None
-    return [file for file in files if file.name.startswith("estop-") and file.name.endswith(end)]
+    # The names of several robots may end alike. The lock of its launcher, which each has here, tells its whole name.
+    ends = [f"{lock.stem.removeprefix('launcher')}.json" for lock in files if lock.match("launcher-*.lock")]
+    others = tuple(other for other in ends if other.endswith(end) and other != end)
+    ours = (file for file in files if file.name.endswith(end) and not file.name.endswith(others))
+    return [file for file in ours if file.name.startswith("estop-")]
 
 
 def _names_of(config: Config) -> list[str]:

@@ -23,8 +23,8 @@ class AliasUse:
         self._log, self._peers, self._begin, self._end, self._owners = log, peers, begin, end, owners
         self.permitted = False  # other devices have had time to object
         self._device: Device | None = None
-        self.used: dict[str, tuple[Alias, Subscription | None]] = {}  # by claim
-        self._rivals: dict[str, list[str]] = {}  # other devices with the same claim, by claim, as last logged
+        self.used: dict[str, tuple[Alias, Subscription | None]] = {}  # by `Alias.claim`
+        self._rivals: dict[str, list[str]] = {}  # by claim: the other devices that have it, as last logged
 
     def __contains__(self, alias: Alias) -> bool:
         return alias.claim in self.used

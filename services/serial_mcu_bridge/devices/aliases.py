@@ -66,7 +66,7 @@ def _why_not(claim: str, interface: Mapping[str, Any], lookup: Lookup) -> str:
     channel = lookup(claim)
     if channel is None:
         return ""
-    profile = _OPEN.get(channel.suffix)  # empty: the generic body, which names the device
+    profile = _OPEN.get(channel.suffix)  # None: not for MCUs; "": the generic body, which names the device
     if profile is None:
         return "the channel is the robot's own"
     if profile and channel.remote and interface.get("local_only"):

@@ -8,12 +8,9 @@ from typing import Any
 
 from pebble.contract import (
     GROUP,
-    IMU,
-    IMU_FAST,
     MCU_COMMAND,
     MCU_DESCRIBE,
     MCU_LOCAL_ONLY,
-    MCU_VALUE,
     Channel,
     Kind,
     codec,
@@ -70,7 +67,6 @@ _UID_QUERY = Channel(
 class DescribedBridge(SerialService):
     """The service of one MCU. It publishes the MCU's topics while it is connected, and clears them afterwards."""
 
-    publishes = (MCU_DESCRIBE, MCU_LOCAL_ONLY, MCU_VALUE, IMU_FAST, IMU)
     end = END
     boot_s = 0.0  # bytes that are no frame are skipped
     retry_s = 0.25  # the topics exist within 2 s of plugging in
@@ -342,7 +338,7 @@ class DescribedBridge(SerialService):
         if uid is None:  # the filter's + also matches an empty level
             self.counters.add("refused")
             return
-        manifest = None
+        manifest = None  # of an empty message: the manifest was removed
         if message.payload:
             try:
                 manifest = codec.decode(MCU_DESCRIBE, message.payload)
@@ -353,6 +349,7 @@ class DescribedBridge(SerialService):
         self.post_message(MCU_DESCRIBE, partial(self._receive_manifest, uid, manifest, message.retain))
 
     def _receive_manifest(self, uid: str, manifest: McuManifest | None, retained: bool) -> None:
+        """Follow the manifests of other devices, whose claims decide about our aliases; restore our own if removed."""
         if self.device is not None and uid == self.device.uid:
             if manifest is None:
                 self.republish()  # another process removed it, for example that of a device with the same uid
@@ -361,7 +358,7 @@ class DescribedBridge(SerialService):
             self._peers.forget(uid)
         else:
             self._peers.add(uid, frozenset(claims(manifest).granted), self.clock(), retained=retained)
-            if retained:  # ask the device's bridge for the manifest: one that does not come in time, _tick removes
+            if retained:  # let the device's bridge publish it again: if none does so in time, _tick clears it
                 self.publish(MCU_COMMAND, {}, uid=uid, name=RESERVED)
         self.aliases.update()
         self._arm()

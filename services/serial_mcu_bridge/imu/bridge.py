@@ -21,7 +21,6 @@ _WATCH_S = 0.5
 class ImuBridge(SerialService):
     """The service of a sensor, to which it sends nothing. Samples must change while drive commands move the wheels."""
 
-    publishes = (IMU_FAST, IMU)
     receive_only = True
 
     def __init__(self, *arguments: Any, **options: Any) -> None:

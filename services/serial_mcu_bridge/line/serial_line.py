@@ -102,7 +102,7 @@ class SerialLine:
         kind of a second line, such as one for lights, that ``line`` also holds; a waiting line of that kind is dropped.
         """
         outbox = self.output.outbox
-        at_once = line if valid_s > 0 else b""  # else the outbox judges whether it has expired
+        at_once = line if valid_s > 0 else b""  # b"": it may have expired, as the outbox judges
         return self._hand_over(lambda now: outbox.drive(line, now, valid_s, replaces), at_once)
 
     def halt(self) -> bool:
@@ -136,7 +136,7 @@ class SerialLine:
     # -- any thread
 
     def _hand_over(self, place: Callable[[float], None], line: bytes) -> bool:
-        """Write ``line`` at once on the caller's thread; if it is b"" or has to wait, ``place`` fills the outbox."""
+        """Write ``line`` at once; if it is b"" or has to wait, ``place`` fills the outbox. False: not open."""
         now = time.monotonic()
         with self._lock:
             port, output = self._port, self.output

@@ -234,6 +234,7 @@ def _all_differ(what: str, values: list[Any]) -> None:
 
 
 def _plain_interface(interface: Interface) -> dict[str, Any]:
+    kind = _ENCODINGS[1]  # the only one
     plain: dict[str, Any] = {
         "id": interface.id,
         "name": interface.name,
@@ -242,7 +243,7 @@ def _plain_interface(interface: Interface) -> dict[str, Any]:
         "channel": interface.channel,
         "profile": interface.profile,
         "rate_hz": interface.rate_hz,
-        "encoding": {"kind": _ENCODINGS[1], "fields": [_plain_field(field) for field in interface.fields]},
+        "encoding": {"kind": kind, "fields": [_plain_field(field) for field in interface.fields]},
     }
     flags = {"retain": interface.retain, "local_only": interface.local_only}
     return plain | {name: True for name, is_set in flags.items() if is_set}

@@ -91,11 +91,11 @@ class HallMemory:
             memory = self._mapped(descriptor)
             form = (_MAGIC, _VERSION, self._slots, 0)
             *header, newest = _HEADER.unpack_from(memory)
-            if tuple(header) == form:  # its readers go on
+            if tuple(header) == form:  # a ring like ours: its readers go on
                 self._number = max(self._number, newest)
             else:
                 _HEADER.pack_into(memory, 0, *form, self._number)
-            if is_new:  # with src_dir_fd Python follows the link in /proc
+            if is_new:  # src_dir_fd lets Python follow the link in /proc, to the file itself
                 os.link(f"/proc/self/fd/{descriptor}", self._path, src_dir_fd=descriptor)
         except BaseException:
             os.close(descriptor)

@@ -50,7 +50,6 @@ class MotorBridge(MotorOwner, SerialService):
     A bridge of another text protocol sets ``protocol`` and ``stop_line``.
     """
 
-    publishes = (*MotorOwner.publishes, c.MOTOR_POWER, c.TOUCH_SENSORS, c.CHARGING_STATUS, c.CHARGING_LEVEL)
     company = (c.LIGHTS_SOLID, c.LIGHTS_FLASH)
     protocol: ClassVar[MotorProtocol] = goob_base
     stop_line = goob_base.STOP

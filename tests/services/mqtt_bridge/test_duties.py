@@ -17,7 +17,7 @@ from pebble.config import SystemControl, load
 from pebble.contract import CHANNELS, GIT_PULL, REBOOT, Kind
 from pebble.runtime.parent import Notifier
 from pebble.services.mqtt_bridge.motor_owners import MotorOwners
-from pebble.services.mqtt_bridge.requests.actions import ACTIONS, Action, Row
+from pebble.services.mqtt_bridge.requests.actions import ACTIONS, LOOK_S, Action, Row
 from pebble.services.mqtt_bridge.requests.earlier_names import CallIn, EarlierNames, keep_stops
 from pebble.services.mqtt_bridge.vouching import Vouching
 from pebble.transports import Answer, Transport
@@ -144,9 +144,12 @@ def make(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> Iterator[Callable[
     yield action
     for made in actions:
         made._process = None
-    for thread in threading.enumerate():
-        if thread.name.startswith("action "):
-            thread.join(WAIT_S)
+    for thread in followers():
+        thread.join(WAIT_S)
+
+
+def followers() -> list[threading.Thread]:
+    return [thread for thread in threading.enumerate() if thread.name.startswith("action ")]
 
 
 def finished(action: Action) -> bool:
@@ -180,8 +183,7 @@ def test_refused_while_it_runs(make: Callable[..., Action], tmp_path: Path) -> N
     action = make(*PYTHON, f"import os\nwhile not os.path.exists({str(gate)!r}): pass")
     assert action.request()
     assert not action.request()
-    follows = [thread.daemon for thread in threading.enumerate() if thread.name == f"action {action.name}"]
-    assert follows == [True], "a bridge ends before the command that restarts it does"
+    assert [thread.daemon for thread in followers()] == [True], "a bridge ends before the command that restarts it does"
     gate.touch()
     assert until(lambda: not action.running)
     assert finished(action)
@@ -217,6 +219,16 @@ def test_the_file_of_a_command_that_floods_stays_small_and_has_its_last_words(
     later = [*PYTHON, "import time; time.sleep(1); print('z' * 3_000_000)"]
     assert finished(make(*PYTHON, f"import subprocess; subprocess.Popen({later})"))
     assert until(lambda: file.read_text()[-2:] == "z\n" and file.stat().st_size < 100_000)
+
+
+def test_its_thread_ends_with_the_last_program_that_it_has_left(make: Callable[..., Action], tmp_path: Path) -> None:
+    waits = ["sh", "-c", "until [ -e gate ]; do sleep 0.05; done"]
+    assert finished(make(*PYTHON, f"import subprocess; subprocess.Popen({waits})", cwd=tmp_path))
+    follower = followers()[0]
+    follower.join(2 * LOOK_S)
+    assert follower.is_alive(), "it limits the output"
+    (tmp_path / "gate").touch()
+    assert until(lambda: not followers())
 
 
 def test_runs_also_where_no_file_can_be_written(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -351,6 +363,19 @@ def test_a_stopped_robot_stays_stopped_under_another_name(
     files[1].write_text(FREE)
     keep_stops(load(path))
     assert files[1].read_text() == FREE, "it was reset"
+
+
+@pytest.mark.parametrize(("file", "left"), [("serial-my-", "serial-my-"), ("front-", "serial-")])
+def test_a_stop_of_a_robot_whose_name_ends_alike_stays(tmp_path: Path, file: str, left: str) -> None:
+    """Both robots share a state directory; *front* was a motor owner of the robot itself."""
+    path, line = tmp_path / "robot.json", {"enabled": True, "serial": {"port": "/dev/null"}}
+    robot, transport = {"system": "pebble", "id": "goob"}, {"kind": "zenoh", "state_dir": str(tmp_path)}
+    path.write_text(json.dumps({"robot": robot, "transport": transport, "services": {"serial_mcu_bridge": line}}))
+    for lock in ("launcher-my-pebble+robots+goob.lock", "launcher-pebble+robots+goob.lock"):
+        (tmp_path / lock).touch()
+    (tmp_path / f"estop-{file}pebble+robots+goob.json").write_text(STOPPED)
+    keep_stops(load(path))
+    assert [path.name for path in tmp_path.glob("estop-*")] == [f"estop-{left}pebble+robots+goob.json"]
 
 
 def test_what_another_robot_retains_stays(robot: Named) -> None:

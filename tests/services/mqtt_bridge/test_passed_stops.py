@@ -184,17 +184,28 @@ def test_the_bridge_repeats_it_on_the_robots_side_only(monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize(
-    ("boot", "persisted", "repeats"), [("00000001", True, False), ("00000001", False, True), ("00000002", True, True)]
+    ("presses", "boot", "counts", "persisted", "repeats"),
+    [
+        ("-", "00000001", [1], True, False),
+        ("-", "00000001", [1], False, True),
+        ("-", "00000002", [1], True, True),
+        ("--", "00000001", [1], True, True),  # which of them was received is not known
+        ("--", "00000001", [1, 2], True, False),
+        ("c-", "00000001", [1], True, True),  # the owner has received the other one, or this one
+        ("---", "00000001", [1, 2], True, True),
+    ],
 )
 def test_without_a_name_an_owner_that_lives_and_saves_it_gets_it_once(
-    boot: str, persisted: bool, repeats: bool
+    presses: str, boot: str, counts: list[int], persisted: bool, repeats: bool
 ) -> None:
     stops = PassedStops(ONE, lambda: 0.0)
     stops.follow("serial", FREE)
-    stops.accept(payload("a"), nameless=True)
+    for press in presses:
+        stops.accept(payload("c") if press == "c" else named(b"{}"), nameless=press == "-")
     assert stops.repeat()
-    state = replace(FREE, boot=boot, latched=True, count=1, recent=[NAME["b"]], persisted=persisted)
-    stops.follow("serial", state)
+    for count in counts:
+        state = replace(FREE, boot=boot, latched=True, count=count, recent=[NAME["b"]], persisted=persisted)
+        stops.follow("serial", state)
     assert bool(stops.repeat()) is repeats
 
 

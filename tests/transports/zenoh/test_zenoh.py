@@ -25,7 +25,8 @@ import zenoh
 from pebble.errors import TransportError
 from pebble.extensions.lab.bench.usage import pss_mb
 from pebble.transports import Message, QoS, State, TlsSettings, ZenohSettings, create
-from pebble.transports.zenoh import publishers, wire
+from pebble.transports.zenoh import publishers, transport, wire
+from pebble.transports.zenoh import session as sessions
 from pebble.transports.zenoh.hub import ZenohHub, wills
 from tests.support import ROOT, SOON_S, WAIT_S, free_port, until
 from tests.transports.forked import Forked
@@ -370,6 +371,28 @@ def test_the_run_directory_is_private_and_empty_in_the_end(robot: ZenohNet) -> N
         client.close()
     assert robot.hub.end() == (0, "")
     assert list(robot.hub.settings.run_dir.iterdir()) == []
+
+
+def test_a_run_that_ends_late_takes_no_part_in_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The transport is opened again while the first run still tries to open a session."""
+    begun, goes_on = threading.Event(), threading.Event()
+
+    def open_session(_config: zenoh.Config) -> zenoh.Session:
+        begun.set()
+        goes_on.wait(WAIT_S)
+        raise zenoh.ZError("no hub")
+
+    monkeypatch.setattr(transport, "OPEN_SYNC_S", 0.0)
+    monkeypatch.setattr(transport, "HUB_ANSWER_S", 0.0)
+    monkeypatch.setattr(sessions, "open_session", open_session)
+    client = create("zenoh", "late", ZenohSettings(run_dir=tmp_path / "run", client=True)).open(0)
+    assert begun.wait(WAIT_S)
+    client.close()
+    client.open(0)
+    runs = [thread for thread in threading.enumerate() if thread.name == "pebble-zenoh late"]
+    goes_on.set()
+    assert (len(runs), until(lambda: not runs[0].is_alive()), runs[1].is_alive()) == (2, True, True)
+    client.close()
 
 
 def test_no_thread_of_zenoh_takes_signals_away_from_the_main_thread(robot: ZenohNet) -> None:

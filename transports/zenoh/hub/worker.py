@@ -58,7 +58,7 @@ class HubWorker:
         session.declare_subscriber(wire.RETAINED + "**", retain, allowed_origin=zenoh.Locality.REMOTE)
         session.declare_queryable(wire.RETAINED + "**", direct(partial(self._intake.ask, self._query)), complete=True)
         for what, work in ((wire.HELLO, self._on_hello), (wire.BYE, self._on_bye)):
-            for key in (what, f"{what}/*"):
+            for key in (what, f"{what}/*"):  # without an account, and with one
                 session.declare_queryable(key, direct(partial(self._intake.greet, work)))
         note_client = direct(lambda sample: self.post(partial(self._on_client, sample)))
         session.liveliness().declare_subscriber(wire.LIVE + "*", note_client, history=True)
@@ -119,7 +119,7 @@ class HubWorker:
         self._waiting.received(stamp.origin, stamp.retained_count)
 
     def _query(self, query: zenoh.Query) -> None:
-        """Queue a subscriber's query, which names the messages that the answer must include."""
+        """Answer a subscriber's query, at once or when as many messages of each client have come as it names."""
         try:
             needs = wire.decode_counts(_payload(query))
         except (ValueError, msgspec.DecodeError):
@@ -139,7 +139,7 @@ class HubWorker:
         if "*" not in text:
             retained = self._store.get(text.removeprefix(wire.RETAINED))
             return [] if retained is None else [retained]
-        begin = text.partition("*")[0].rstrip("$/")  # a quick choice: "$*" is a wildcard, and "a/**" matches "a"
+        begin = text.partition("*")[0].rstrip("$/")  # a quick choice; no $ of "$*", and no /: "a/**" matches "a"
         keyed = ((wire.RETAINED + retained.key, retained) for retained in self._store.retained())
         return [retained for key, retained in keyed if key.startswith(begin) and wanted.intersects(key)]
 
@@ -157,7 +157,7 @@ class HubWorker:
             self.apply(StoredWill(hello.name, hello.will))
             lacking = self._store.lacks(hello)
             if lacking:
-                self._waiting.forget(hello.name)  # the client sends these, and then another hello
+                self._waiting.forget(hello.name)  # not all is here: the client sends these, and then another hello
             elif not account:  # no subscriber waits for what other machines retain
                 self._waiting.count_from(hello.name, hello.retained_count)
             query.reply(wire.asked(wire.HELLO, account), wire.encode(lacking))
@@ -170,7 +170,7 @@ class HubWorker:
             will = self._store.will(name)
             if will is not None and will.client == hello.will.client:
                 self.forget_will(name)
-                if topic_to_key(will.topic) not in hello.own:
+                if topic_to_key(will.topic) not in hello.own:  # else the client retains a value there, or removed it
                     self._publish_will(name, will)
 
     def _on_bye(self, query: zenoh.Query) -> None:

@@ -34,10 +34,10 @@ def robot_account(
 ) -> Iterator[CheckResult]:
     """Publish probe messages below ``base`` and check that the broker accepts them.
 
-    No program takes a probe for anything else. ``reads``: a further filter that the broker must grant. A probe must
-    come back within ``answer_s`` with MQTT 3.1.1, which tells no refusal, or if ``reads`` is given; with MQTT 5 a probe
-    among the commands must, unless it is refused. Above the level ``open``, a probe in the name of another robot must
-    not come back.
+    No program takes a probe for anything else. ``reads``: a further filter that the broker must grant. The probe
+    must come back within ``answer_s`` with MQTT 3.1.1, which tells no refusal, or if ``reads`` is given. Otherwise a
+    second probe must, among the commands, unless it is refused. Above the level ``open``, a probe in the name of
+    another robot must not come back.
     """
     try:
         with reached(settings, "") as trial:  # "": no topic here is below it, as all are complete
@@ -70,12 +70,13 @@ def _rights(trial: BrokerTrial, peer: Peer, topic: str, reads: str, *, must_come
         return failed(text, "pebble fleet check; its role is page")
     peer.subscribe(topic)
     is_back, refusal = _echo(trial, peer, topic)
-    if peer.closed and _takes_qos_0(trial, topic):
+    if peer.closed and _takes_qos_0(trial, topic):  # it hung up on QoS 1 alone
         return warn("takes no QoS 1: what is lost on the way is not sent again", f"{MOSQUITTO}max_qos 2")
     if refusal or (must_come_back and not is_back):
         why = refusal or "it does not come back (or may this account not read it?)"
         fix = f"allow it to write and read {topic.rpartition('/')[0]}/# on the broker"
         return failed(f"this account may not publish to {topic}: {why}", fix)
+    # Where the probe need not come back, one among the commands shows whether the robot receives anything.
     if not must_come_back and (why := _why_deaf(trial, topic.replace("/outgoing/", "/incoming/"))):
         return failed(why, "allow it to read what it subscribes to on the broker")
     return ok("accepts what this account publishes")
@@ -131,7 +132,7 @@ def _rules(what: str, trial: BrokerTrial, peer: Peer, topic: str) -> CheckResult
         fix = "start it with the files of `pebble fleet init FOLDER --host NAME`, see docs/ext/fleet.md"
         return failed("has no rules: with this account one can pose as any robot, and drive it", fix, what)
     code = peer.acks.get(mid, 0)
-    if code >= REFUSED and not reasons.concerns_login(code):
+    if code >= REFUSED and not reasons.concerns_login(code):  # as "not authorized" does, the answer of a rule
         return warn(f"refuses a message to another robot, but not for that: {reasons.words(code)}", what=what)
     if not is_back and not peer.closed:
         return warn("does not answer in time: whether it has rules is not known", what=what)

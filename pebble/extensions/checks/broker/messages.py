@@ -132,6 +132,7 @@ def refusals(trial: BrokerTrial) -> CheckResult:
 
 
 def topics(trial: BrokerTrial) -> CheckResult:
+    """Check that the broker carries topics of unusual characters or length."""
     reader = trial.peer()
     reader.subscribe("#", qos=0)
     for name in _ODD_TOPICS.values():

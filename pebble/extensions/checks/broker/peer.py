@@ -70,7 +70,7 @@ class Peer(packets.Listener):
         self.pongs: list[int] = []  # how many messages had been received at each answer to a ping
         self.code: int | None = None  # of CONNACK
         self.problem = ""
-        self._bytes = 0  # received in messages, and for answers
+        self._bytes = 0  # received in messages; each answer counts as _ANSWER_BYTES
         self._trial, self.base = trial, base
         self._client = Client(opening, self, bridge=bridge)
         self._client.open()
@@ -311,13 +311,14 @@ class BrokerTrial:
 
     def close(self) -> None:
         """Remove all retained messages of this trial; those that the broker keeps stay in ``left``."""
-        self.begin()
+        self.begin()  # disconnects the peers of the last probe
         if not self.left:
             return
         self.base = ""  # topics in ``left`` are complete
         with suppress(TransportError):
             peer = self.peer()
             numbers = {peer.publish(topic, b"", qos=self.qos, retain=True) for topic in list(self.left)}
+            # With QoS 0 nothing is acknowledged, but a ping is answered after what was sent before it.
             is_done = self.wait(lambda: all(number in peer.acks for number in numbers)) if self.qos else peer.ping()
             if is_done:
                 self.left = {}

@@ -71,8 +71,8 @@ def order(trial: BrokerTrial) -> CheckResult:
     trial.wait(lambda: all(b"%d" % newest in reader.payloads() for reader in readers))
     trial.wait_quiet(*readers)
     wrong = [reader for reader in readers if reader.payloads()[-1:] != [b"%d" % newest]]
-    # Of these, the newest message is lost, or came before an older live one. The other readers got a message with the
-    # retain flag last: it was sent for the subscription, but later than newer live ones.
+    # Readers in `live_last` got the newest message before an older live one, or not at all. The others in `wrong` got a
+    # message with the retain flag last: it was sent for the subscription, but later than newer live ones.
     live_last = [reader for reader in wrong if not reader.received or not reader.received[-1].retain]
     if live_last:
         return failed("the last value that comes to a new subscription is not the newest", OTHER)

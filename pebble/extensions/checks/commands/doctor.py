@@ -117,6 +117,7 @@ def _check_modes(modes: dict[str, bool], options: dict[str, bool]) -> None:
 
 
 def _running(config: Path, places: Places, *, may_move: bool, as_json: bool) -> int:
+    """Test a robot that runs, with ``may_move`` also its wheels, if a person agrees; return the exit code."""
     from pebble.extensions.checks.check import run
     from pebble.extensions.checks.running.checks import CHECKS, MOVING  # of Linux only
     from pebble.extensions.checks.running.robot import become_user_of, reached
@@ -184,8 +185,8 @@ def _broker(settings: MqttSettings, below: str, *, restart: bool, as_json: bool)
     if not as_json:
         for line in words:
             typer.secho(line, bold=True)
-    limits = printer.end(warnings_count=True, assessment=words)
-    return 2 if printer.names("failed") else limits
+    code = printer.end(warnings_count=True, assessment=words)  # 1 for warnings, too: they are limits
+    return 2 if printer.names("failed") else code
 
 
 def _ask_to_restart() -> bool:

@@ -299,7 +299,7 @@ def _confirmed(_robot: Observer, _name: str) -> CheckResult:
 def _after_long_ones(robot: Observer) -> CheckResult:
     """Check that a stop still reaches the robot after messages that are too long for small boards."""
     stops_it = while_stopped(_confirmed)
-    if stops_it(robot).state is not State.OK:  # if it is, the robot has read everything that was sent before
+    if stops_it(robot).state is not State.OK:  # OK: it has read all that was sent before
         return skipped("no stop reaches it without them, either")
     for _ in range(_BURSTS):
         for _ in range(_LONGS):
@@ -319,6 +319,7 @@ def _repeated(robot: Observer) -> CheckResult:
     stop_names: list[str] = []  # the name that while_stopped chose
 
     def send_same_stop(robot: Observer, name: str) -> CheckResult:
+        """Check that the stop called ``name``, which the robot knows already, is not counted again."""
         stop_names.append(name)
         before = _counts(robot)
         robot.send(c.ESTOP, EstopCommand(stop=name, by=BY, why=_WHY))

@@ -119,7 +119,8 @@ def _first_keeps(robot: Observer, driver: Driver) -> CheckResult:
 
 
 def _shows_asker(robot: Observer, driver: Driver) -> CheckResult:
-    driver.asks(for_ms=5 * _SHORTEST_MS)
+    """Check that the request of a second driver is shown, and no longer than it lasts."""
+    driver.asks(for_ms=5 * _SHORTEST_MS)  # longer than this test: the second must not get what has ended
     second = Driver(robot)
     second.asks()
 
@@ -134,6 +135,7 @@ def _shows_asker(robot: Observer, driver: Driver) -> CheckResult:
 
 
 def _released(robot: Observer, driver: Driver) -> CheckResult:
+    """Check that control ends by the release of who has it, and not by another's."""
     driver.asks(for_ms=5 * _SHORTEST_MS)
     Driver(robot).asks("release")
     if robot.happens(lambda: not driver.holds):
@@ -144,6 +146,7 @@ def _released(robot: Observer, driver: Driver) -> CheckResult:
 
 
 def _taken(robot: Observer, driver: Driver) -> CheckResult:
+    """Check that control passes to a second driver that takes it from ``driver``, with a new key."""
     key, second = driver.key, Driver(robot)
     second.takes()
     took = robot.answers(lambda: second.holds)

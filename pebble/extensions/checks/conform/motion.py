@@ -159,8 +159,8 @@ def rested(robot: Observer, began: float, last: float, limit_s: float, what: str
     return ok(f"it rests {max(0.0, until - last):.2f} s after {what}")
 
 
-def _moved(robot: Observer, since: float, why: str, fix: str) -> CheckResult:
-    """Return a failure if the robot has moved after ``since``."""
+def _not_moved(robot: Observer, since: float, why: str, fix: str) -> CheckResult:
+    """Return ok if the robot has not moved after ``since``, else a failure."""
     robot.look(robot.patience_s)
     until = moves_until(robot, since)
     if until is None:
@@ -230,7 +230,7 @@ def _reset_waits(robot: Observer, driver: Driver) -> CheckResult:
         driver.send(key=_OTHER_KEY)  # a zero
     driver.drive()
     why = "a stick that is held down moves it after a reset"
-    outcome = _moved(robot, began, why, "wait for a zero of who has control, or for 0.5 s without commands")
+    outcome = _not_moved(robot, began, why, "wait for a zero of who has control, or for 0.5 s without commands")
     if outcome.state is State.OK:
         driver.send()  # the zero that counts as a release: now it must move
         outcome = _rest(robot, *driver.drive(), RESTS_S)
@@ -242,7 +242,7 @@ def _not_a_number(robot: Observer, _driver: Driver) -> CheckResult:
     began = time.monotonic()
     for number in (b"NaN", b"Infinity", b"1e999", b'"nan"', b"null"):
         robot.send(c.DRIVE, b'{"x": 0, "z": %s}' % number)
-    return _moved(robot, began, "it moves by a command that is no number", "refuse NaN and infinity")
+    return _not_moved(robot, began, "it moves by a command that is no number", "refuse NaN and infinity")
 
 
 def _clamped(robot: Observer, driver: Driver) -> CheckResult:
@@ -263,12 +263,12 @@ def _foreign_key(robot: Observer, driver: Driver) -> CheckResult:
     """Check that commands with another's key move nothing, while someone has control and while nobody has."""
     why, fix = "it moves by another's key", "refuse what moves and has another key"
     began, _ = driver.drive(key=_OTHER_KEY)
-    outcome = _moved(robot, began, why, fix)
+    outcome = _not_moved(robot, began, why, fix)
     if outcome.state is not State.OK:
         return outcome
     driver.leaves()
     began, _ = driver.drive(DRIVES_S / 2, key=_OTHER_KEY)
-    return _moved(robot, began, f"{why} while no one has control", fix)
+    return _not_moved(robot, began, f"{why} while no one has control", fix)
 
 
 def _control_passes(robot: Observer, driver: Driver) -> CheckResult:
@@ -285,7 +285,7 @@ def _control_passes(robot: Observer, driver: Driver) -> CheckResult:
 
 def _keyless(robot: Observer, driver: Driver) -> CheckResult:
     began, _ = driver.drive(key="")
-    return _moved(robot, began, "it moves by a command without a key", "at level named refuse those")
+    return _not_moved(robot, began, "it moves by a command without a key", "at level named refuse those")
 
 
 def _foreign_account(robot: Observer, driver: Driver) -> CheckResult:
@@ -294,7 +294,7 @@ def _foreign_account(robot: Observer, driver: Driver) -> CheckResult:
     began = time.monotonic()
     delivered = [robot.send_as(account, c.DRIVE, command) for account in (_OTHER_ACCOUNT, "")]
     fix = "a key counts with the account that asked for it"
-    outcome = _moved(robot, began, "it moves by a key that another sends", fix)
+    outcome = _not_moved(robot, began, "it moves by a key that another sends", fix)
     if outcome.state is not State.FAILED and not all(delivered):
         return skipped(UNSEEN)
     return outcome

@@ -89,7 +89,7 @@ def values_in(name: str, raw: bytes) -> Iterator[str]:
     if name.endswith(_PROGRAMS):  # have "password=" in them, and no password
         return
     for match in _settings(text):
-        value = next(filter(None, match), "").strip()
+        value = next(filter(None, match), "").strip()  # in the group that has matched
         if value.lower() not in _NOTHING:
             yield from {value, _decoded(value)}
     # A file such as `mqtt-password`, in which each line is a secret: neither of keys nor JSON, which are read above.

@@ -97,7 +97,7 @@ def _unready(robot: RobotUnderTest) -> list[str]:
 def heartbeats(robot: RobotUnderTest) -> CheckResult:
     """Check that operators receive its heartbeats without gaps."""
     side, section = robot.operators, robot.config.services.mqtt_bridge.heartbeat
-    if side is None:
+    if side is None:  # why_operators: why it could not be reached
         why = robot.why_operators
         return failed(why, "pebble doctor CONFIG") if robot.config.services.mqtt_bridge.enabled else skipped(why)
     if not section.enabled:
@@ -106,6 +106,7 @@ def heartbeats(robot: RobotUnderTest) -> CheckResult:
     liveness = side.view.liveness
 
     def longest() -> float:
+        """Return the longest gap that is allowed on the link as it is now."""
         interval_s = max(section.interval_seconds, LEVELS[liveness.link].heartbeat_s)
         return max(
             silent_after(interval_s, liveness.link, liveness.average_latency_s or 0.0), _LONGEST_GAP * interval_s

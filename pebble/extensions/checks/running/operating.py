@@ -101,8 +101,8 @@ def _end(robot: RobotUnderTest, name: str, before: dict[str, list[str]]) -> str:
     if not view.latched:
         return ""
     for owner, state in view.estop.latched.items():
-        # this stop is not the newest, or another one came before it since ``before``
-        if state.recent[:1] != [name] or not set(state.recent[1:]) <= set(before.get(owner, [])):
+        others, known = state.recent[1:], before.get(owner, [])
+        if state.recent[:1] != [name] or any(other not in known for other in others):  # there are other new stops
             return f"it was stopped by another one meanwhile, and stays so ({state.by or 'unknown'}: {state.why})"
     reset = Reset(view.estop, robot.by)
     send(partial(robot.own_side.transport.publish, urgent=True), reset.messages())
@@ -118,7 +118,7 @@ def retained_commands(robot: RobotUnderTest) -> CheckResult:
     reset of another kind follows, which must be answered: this shows that the silence before was no accident.
     """
     operators = robot.commanding_side
-    if robot.own_side.heartbeats:  # the bridge sends them to the operators' broker only: so it is this one
+    if robot.own_side.heartbeats:  # the bridge sends them to the operators' broker alone: so both sides are there
         return skipped("one broker serves both sides: there, what is published to be retained is live at first")
     owner, state = next(iter(robot.view.estop.states.items()), (None, None))
     if owner is None or state is None:
@@ -132,7 +132,7 @@ def retained_commands(robot: RobotUnderTest) -> CheckResult:
         states = [record for record in operators.of(ESTOP_STATE, began) if record.metric == metric]
         return {record.value.reset_refused for record in states if record.value is not None}
 
-    def publish_retained(payload: bytes) -> None:
+    def publish_retained(payload: bytes) -> None:  # by ``beside``, a connection that is made below
         beside.publish(topic, payload, qos=QoS.DELIVERED, retain=True, remember=False)
         robot.wait(lambda: beside.outgoing.waiting == 0, robot.patience_s)
 

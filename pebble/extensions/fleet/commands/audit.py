@@ -36,7 +36,7 @@ def audit(
     except OSError as error:
         raise PebbleError(f"{error.filename}: {error.strerror}; run it as the robot's user") from None
     lines = [line for line in content.splitlines() if line]
-    rows = sorted((row for row in map(_row, lines[-limit:]) if row), key=itemgetter(0))  # by time: × is stored late
+    rows = sorted((row for row in map(_row, lines[-limit:]) if row), key=itemgetter(0))  # by time: × rows come late
     print_table(("time", "what", "who", "from", ""), [columns for _, columns in rows])
     typer.echo(f"{newer}: {len(lines):,} rows" if lines else "nothing yet: the bridge of this robot writes it")
     if unread := min(limit, len(lines)) - len(rows):

@@ -50,17 +50,17 @@ def gateway(
     settings, name, run_dir = load_gateway(file)
     set_up_logging("INFO")
     programs: list[_Program] = []
-    places = [*settings.hub.connect]
+    near = [*settings.hub.connect]  # on the side of the robots
     if (boards := settings.boards) is not None:
-        places.append(f"{boards.host}:{boards.port}")
+        near.append(f"{boards.host}:{boards.port}")
         programs += [of_board(base, robot, boards, run_dir) for base, robot in settings.neighbours.items()]
     if (mqtt := settings.operators) is not None:
         transports = gateway_transports(settings, mqtt, run_dir, will(name))
         programs.append(Gateway(name, settings.robots, *transports))
-    others = [f"{mqtt.host}:{mqtt.port}"] if mqtt is not None else []
-    others += [endpoint for robot in settings.neighbours.values() for endpoint in robot.lan.connect]
+    far = [f"{mqtt.host}:{mqtt.port}"] if mqtt is not None else []  # and on the other side
+    far += [endpoint for robot in settings.neighbours.values() for endpoint in robot.lan.connect]
     typer.echo(
-        f"gateway {name} between {', '.join(places)} and {', '.join(dict.fromkeys(others))}; Ctrl-C ends it", err=True
+        f"gateway {name} between {', '.join(near)} and {', '.join(dict.fromkeys(far))}; Ctrl-C ends it", err=True
     )
     return _Together(programs).run(Notifier().ready)
 

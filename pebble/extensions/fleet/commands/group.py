@@ -245,7 +245,7 @@ def certificate(
         if is_hub and not hosts:
             raise FleetError(f"{name} is a hub: name where others reach it, `pebble fleet certificate {name} HOST`")
         taken = set(fleet.accounts)
-        if not is_hub:  # it may run on a broker's machine
+        if not is_hub:  # a hub may have a broker's names, as both may run on one machine
             taken.update(certificates.hosts_of(host for server in fleet.brokers for host in applying.names_of(server)))
         host_names = set(certificates.hosts_of(hosts)) if hosts else set[str]()
         if conflicts := host_names & (taken - {name}):
@@ -335,7 +335,8 @@ def _init_again(place: Path, host: str | None, level: str | None, plain: bool | 
 def _locked_fleet(folder_: Path | None, *, any_rules: bool = False) -> Iterator[tuple[Path, Fleet]]:
     """Yield a fleet and its folder, locked against changes by others. Raises PebbleError.
 
-    ``any_rules``: also a fleet whose rules mosquitto still takes from its plugin, not from files.
+    Root acts as the folder's owner meanwhile. ``any_rules``: also a fleet whose rules mosquitto still takes from its
+    plugin, not from files.
     """
     place = _place(folder_)
     with as_owner(place, *LAZY_MODULES), folder.locked(place):
@@ -397,7 +398,7 @@ def _print_account(place: Path, fleet: Fleet, name: str, secret: str, how: str, 
         typer.echo(json.dumps(pieces.boards_file(fleet, name, f"{_shown(place)}/"), indent=2))
     elif ProgramRole.EXPANDER in account.roles:
         typer.echo(f"    pebble topic expand {url} --ca-cert {ca} --password-file FILE")
-    elif ProgramRole.GATEWAY not in account.roles:
+    elif ProgramRole.GATEWAY not in account.roles:  # else the login stands in the gateway's own file
         does = "watch" if account.roles == (Role.VIEWER,) else "drive"
         typer.echo(f"    pebble {does} ROBOT --url {url} --ca-cert {ca} --password-file FILE")
 

@@ -117,7 +117,8 @@ class CarriedRobot:
     """A robot of the hub for which the gateway forwards.
 
     ``stops_pass()``: True if stops pass by another connection, so that this forwarder leaves them out; called for each
-    stop. ``too_large``: called with the topic of a message that is too large for any broker.
+    stop. ``too_large``: called with the topic of a message that is too large for any broker. ``beginning``: measures
+    the starts of forwarding, for all robots.
     """
 
     def __init__(
@@ -136,7 +137,7 @@ class CarriedRobot:
         self._allowed: dict[Channel, bool] = {}  # by a medium's channel: its flag is up
         #: By a medium's channel: the newest request at the broker wants it, or (False) ends it; None: there was none.
         self._requested: dict[Channel, bool | None] = {medium: None for medium, _, _ in _MEDIA}
-        self._synchronize_at = self._probe_at = float("-inf")
+        self._synchronize_at = self._probe_at = float("-inf")  # when :meth:`tick` does either next
         self.subjects = NamedSubjects(base)
         self.forwarder = Forwarder(
             self.subjects,

@@ -74,7 +74,7 @@ def flash(
         for warning in config.warnings:
             typer.echo(f"warning: {warning}", err=True)
     password_variables = () if config is None else config.password_variables
-    withhold((WIFI_PASSWORD, *password_variables))
+    withhold((WIFI_PASSWORD, *password_variables))  # from the programs that are started below
     if dry_run:
         show_steps(options, Tools(), typer.echo)
         return 0
@@ -106,6 +106,7 @@ def _target(robot: str, firmware: str | None) -> tuple[Firmware, Config | None]:
 def _private(
     config: Config | None, firmware: Firmware, ssid: str | None, password_file: Path | None, dry_run: bool
 ) -> PrivateFiles:
+    """Return a board's private files; in a dry run with placeholders for its Wi-Fi. Raises PebbleError if one lacks."""
     if config is None:
         raise PebbleError(f"{firmware.name} needs its config file: it names the broker")
     if dry_run:

@@ -68,7 +68,8 @@ def check_answer(answer: str, board: Board) -> BoardInfo:
         raise PebbleError(f"the board runs {name}; install MicroPython with --micropython FILE")
     if board.machine not in machine:
         raise PebbleError(f"the board is a {machine.strip()}, but the firmware is for {board.title}")
-    if (mpy & 0xFF, mpy >> 8 & 3) != MPY_VERSION:
+    mpy_version, mpy_sub_version = mpy & 0xFF, mpy >> 8 & 3  # as sys.implementation._mpy has them
+    if (mpy_version, mpy_sub_version) != MPY_VERSION:
         raise PebbleError(
             f"MicroPython {version} on the board cannot load our .mpy files; --micropython: {board.download}"
         )

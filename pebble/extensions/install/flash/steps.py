@@ -219,12 +219,13 @@ class Steps:
         certificate = self._remote("fs", "cp", str(self._work / CA_FILE), f":{CA_FILE}")
 
         def act() -> None:
+            """Copy the settings, whose passwords stay on the board only, and the authority's certificate, if any."""
             try:
                 _write_private(local, private.text())
                 self._tools.run(command)
             finally:
                 with suppress(FileNotFoundError):
-                    local.unlink()
+                    local.unlink()  # it has passwords, unlike the certificate
             if private.ca is not None:
                 (self._work / CA_FILE).write_bytes(private.ca)
                 self._tools.run(certificate)

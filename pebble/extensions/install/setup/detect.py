@@ -75,7 +75,7 @@ def listen(port: str, seconds: float) -> Board:
 def _received(port: str, baud: int, seconds: float) -> bytes:
     """Return what a board sends by itself in so many seconds; nothing is sent to it."""
     line = serial.Serial(None, baud, timeout=0.05, exclusive=True)
-    line.port, line.dtr, line.rts = port, False, False  # some boards start anew at each of them
+    line.port, line.dtr, line.rts = port, False, False  # before it is opened: DTR or RTS restarts some boards
     received, end = b"", time.monotonic() + seconds
     with line:  # opens it
         while time.monotonic() < end and len(received) < _MOST:

@@ -103,7 +103,7 @@ def _allowed(files: dict[str, Saved], places: Places) -> dict[str, Saved]:
         for name, saved in files.items()
         if name not in links and (name.startswith(folder) or not name.startswith("etc/mosquitto/"))
     }
-    if broker in files:  # its text names no account, so any fleet will do
+    if broker in files:  # its text is the same for every fleet: it names no account
         allowed[broker] = Saved(own_broker.conf_text(places, own_broker.fleet_of("robot", "", places.people)), 0o644)
     if any(name.startswith(folder) for name in allowed) and f"{folder}{FLEET}" not in allowed:
         raise SetupError(f"the backup has files of a broker, and no {folder}{FLEET}: it was changed")

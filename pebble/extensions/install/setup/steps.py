@@ -149,8 +149,8 @@ class Job:
         if typed is not None and self.answers.broker != HERE:
             yield self._file("password of the robot at its broker", file, f"{typed}\n".encode())
         if self.answers.broker == HERE:
-            # Without a config the file is of an unfinished setup; with one, it may be of the broker before this one.
-            # The page's file is of this broker only.
+            # The robot's password stays if it is of an unfinished setup (there is no config), or of this same broker.
+            # The page's stays, as it was never of another one.
             keeps_password = self.config is None or self.has_login
             yield self._new_password("password of the robot at its own broker", file, known=keeps_password)
             if self.answers.page:

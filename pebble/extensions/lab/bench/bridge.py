@@ -84,7 +84,7 @@ def measure(settings: Settings, number: int, progress: Progress) -> Iterator[Cel
     """Yield the results of fresh robots with and without reports of their MCUs, each measured in turns of a second."""
     passes = max(1, round(settings.seconds))
     for load in in_turn((REPORTS, COMMANDS), number):
-        variants = [name for name in settings.variants if name != FLOOR or load == COMMANDS]  # it has no reports
+        variants = [name for name in settings.variants if name != FLOOR or load == COMMANDS]  # FLOOR has none
         turns: dict[str, list[Turn]] = {variant: [] for variant in variants}
         progress("starting the robots")
         with running(variants, reports=load == REPORTS) as driven:
@@ -99,7 +99,10 @@ def measure(settings: Settings, number: int, progress: Progress) -> Iterator[Cel
 
 
 def cells_of(variant: str, load: str, turn: Turn, arrived: Arrived) -> Iterator[Cell]:
-    """Yield the latencies of a turn, and the CPU time for each message. ``arrived``: what came in all turns."""
+    """Yield the latencies of a turn, and the CPU time for each message. ``arrived``: what came in all turns.
+
+    Each command has wheel speeds that no other has, by which it is found again.
+    """
     params = {"load": load}
     down = [(arrived.commands[wheels] - ns) / 1e6 for wheels, ns in turn.sent.items() if wheels in arrived.commands]
     yield round_cell(variant, DOWN, "ms", down, params, sent=len(turn.sent))

@@ -111,12 +111,13 @@ class Participants(Processes):
         self._where: dict[str, object] = {}  # by variant: the folder for sockets, or the broker's port
 
     def start(self) -> None:
+        """Start the broker or hub and both ends of each variant; wait until all are ready."""
         for number, variant in enumerate(self._variants):
             folder, kind = self.folder / str(number), VARIANTS[variant]
             folder.mkdir()
             settings: MqttSettings | ZenohSettings
             if kind == "zenoh":
-                settings = ZenohSettings(run_dir=folder / "z")  # short: paths of Unix sockets
+                settings = ZenohSettings(run_dir=folder / "z")  # a short name: the path of a Unix socket is limited
                 command = python("pebble.extensions.lab.rig.hub", _json(settings))
                 hub = self.add(Program("hub", command, folder / "hub.log"), BROKERS)
                 hub.wait_until((settings.run_dir / "hub.sock").exists, _READY_S)

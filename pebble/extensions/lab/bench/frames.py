@@ -126,14 +126,14 @@ def measure(variant: str, condition: Params, seconds: float) -> Cell:
         after = [cpu_s([program.pid]) for program in measured]
         time.sleep(_LATE_S)
         written, *read = (worker.ask("", _ANSWER_S) for worker in (writer, *readers))
-    cpu = [100 * (now - earlier) / seconds for now, earlier in zip(after, before, strict=True)]
+    cpu_writer, *cpu_others = [100 * (now - earlier) / seconds for now, earlier in zip(after, before, strict=True)]
     latencies_us = [(ns - stamp) / 1000 for answer in read for stamp, ns in answer["arrived"] if stamp in window]
     figures = {
         "sent": sum(stamp in window for stamp in written["stamps"]) * len(read),  # each frame to each reader
-        "cpu_writer": cpu[0], "cpu_reader": fmean(cpu[1 : 1 + len(readers)]),
+        "cpu_writer": cpu_writer, "cpu_reader": fmean(cpu_others[: len(readers)]),
     }  # fmt: skip
     if broker is not None:
-        figures["cpu_broker"] = cpu[-1]
+        figures["cpu_broker"] = cpu_others[-1]
     return round_cell(variant, "frame", "us", latencies_us, condition, **figures)
 
 

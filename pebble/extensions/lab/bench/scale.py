@@ -215,7 +215,7 @@ def main(port: int, count: int) -> None:
     due = time.monotonic()
     while not ended.is_set():
         for topic, publish in boards:
-            due = max(due + HEARTBEAT_S / count, time.monotonic() - HEARTBEAT_S)  # what is later is not made up for
+            due = max(due + HEARTBEAT_S / count, time.monotonic() - HEARTBEAT_S)  # catches up one period at most
             time.sleep(max(0.0, due - time.monotonic()))
             publish(topic, b'{"t": %d, "online": true}' % int(1000 * time.time()))
 

@@ -172,7 +172,7 @@ class Operator:
         with suppress(EndedEarlyError):
             with_scripts = [robot.base for robot in robots if robot.offers("autonomy")]
             self._until(lambda: self._with_trail.issuperset(with_scripts), _LISTED_S)
-            while not (invitation and self.rounds):
+            while not (invitation and self.rounds):  # without an invitation until the demo ends
                 self._show_trails(robots)
                 for step in SCRIPT:
                     self._begin(step.name, robots)
@@ -183,7 +183,7 @@ class Operator:
                 self.rounds += 1
             self._release()
             self._step = invitation
-            while True:
+            while True:  # until the demo ends
                 self._show_trails(robots)
                 self._wait(_TRAIL_S)
         self._begin("disconnecting", robots)

@@ -59,7 +59,7 @@ class View:
             yield
         except OSError:
             self._notice_closed_terminal()
-            is_closed = self._console.quiet  # see _notice_closed_terminal
+            is_closed = self._console.quiet  # _notice_closed_terminal has made it so
             if not is_closed:
                 raise
 

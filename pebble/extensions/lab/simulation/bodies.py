@@ -35,9 +35,10 @@ class Body:
         self.motion = motion or RobotMotion()
         self.battery = Battery(self.cells)
         self.on_motors: Callable[[float, Pair], None] = lambda _now, _motors: None
-        self._advanced_at = self._changed_at = board.clock.now()  # of motion and battery; of the outputs
-        self._motors = self._reported = (0.0, 0.0)  # as the outputs set them; as passed to on_motors
-        self._outputs_changed = False  # since the motors were set by them
+        self._advanced_at = board.clock.now()  # the time to which motion and battery are advanced
+        self._changed_at = self._advanced_at  # when an output last changed
+        self._motors = self._reported = (0.0, 0.0)  # as the outputs set them, and as on_motors was told last
+        self._outputs_changed = False  # since they were last read
         board.pins.before_change = self.before_output_change
 
     def before_output_change(self) -> None:

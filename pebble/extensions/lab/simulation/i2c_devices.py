@@ -33,8 +33,8 @@ class Mpu6050:
         self.bias_dps: Vector = (1.2, -0.8, 0.45)
         self._now, self._motion = now, motion
         self._noise = random.Random(1)  # noqa: S311 - repeatable
-        self._moved_at, self._speed_mm_s = now(), 0.0
-        self._pointer = 0
+        self._moved_at, self._speed_mm_s = now(), 0.0  # the last sample's time, and the speed then
+        self._pointer = 0  # the register that is read next
         self._registers = bytearray(128)  # asleep, at the smallest ranges
         self._registers[_PWR_MGMT_1] = _SLEEP
         self._registers[_WHO_AM_I] = 0x68

@@ -7,13 +7,15 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from pebble.config import Config, load
+from pebble.contract import CAPABILITIES, ONLINE
 from pebble.errors import ConfigError, PebbleError, TransportError
 from pebble.extensions.operator.client.named_topics import NamedTopics
-from pebble.extensions.operator.client.names import ANY_ROBOT, Names, base_of
+from pebble.extensions.operator.client.names import ANY_ROBOT, Names, base_of, spellings
 from pebble.extensions.operator.client.robot_estop import RobotEstop
 from pebble.extensions.operator.client.url import password as password
 from pebble.extensions.operator.client.url import settings_of
@@ -75,7 +77,7 @@ def connected(
             why = transport.problem or f"no answer within {OPEN_TIMEOUT_S:g} s"
             raise TransportError(f"cannot connect to {where}: {why}")
         not_received = _report_missing(transport)  # in words
-        yield transport, names
+        yield transport, _as_spelled(transport, names) if needed else names
         _report_missing(transport, not_received)  # what was subscribed to meanwhile may be refused
 
 
@@ -89,6 +91,22 @@ def connecting(
     return noticed(
         lambda: ": ".join(filter(None, (undone, f"connecting to {where}", undone and problem()))), patience_s
     )
+
+
+def _as_spelled(transport: Transport, names: Names) -> Names:
+    """Return the names of the robot's topics with its accents as it spells them; of one that is silent, as they are."""
+    heard, bases = set[str](), spellings(names.base)
+
+    def hear(base: str, _message: Message) -> None:
+        heard.add(base)
+
+    if len(bases) > 1:  # it has accents
+        handlers = {channel.topic(base): partial(hear, base) for channel in (CAPABILITIES, ONLINE) for base in bases}
+        subscriptions = transport.subscribe_all(handlers, direct=True)
+        wait_for(lambda: heard, _LATE_S)
+        for subscription in subscriptions:
+            subscription.close()
+    return names if names.base in heard or not heard else Names(heard.pop(), account=names.account)
 
 
 @contextmanager
@@ -212,7 +230,7 @@ def subscribed_stop(transport: Transport, base: str) -> RobotEstop:
     robot = RobotEstop(base)
     robot.subscribe(transport)
     wait_for(lambda: robot.has_capabilities, _LATE_S)
-    transport.ask(robot.missing)
+    transport.ask(robot.missing)  # again, for the owners that late capabilities have listed
     wait_for(lambda: not robot.missing, _LATE_S)
     return robot
 

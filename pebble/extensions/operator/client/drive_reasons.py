@@ -127,7 +127,7 @@ def words(
     """Return the sentence for people about a state; "" if it has none. ``driven``: the driver's name."""
     by = stopped.by if stopped is not None and stopped.by else "unknown"
     values = {"name": name, "by": person(by), "who": person(driven), "script": script or "A script", "problem": problem}
-    return WORDS.get(code or "", "").format_map(defaultdict(str, values))
+    return WORDS.get(code or "", "").format_map(defaultdict(str, values))  # "": what only pages fill in
 
 
 def person(by: str, *, login: bool = True) -> str:

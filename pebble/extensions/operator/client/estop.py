@@ -158,7 +158,7 @@ class RobotStop:
     def _update_progress(self, now: float) -> None:
         """Note whether the robot's owners hold the stop now, and whether they would after a power cut."""
         if self.confirmed_s is None:
-            can_hold_all = self.estop.owners and self.estop.available and not self.estop.zeros
+            can_hold_all = self.estop.owners and self.estop.available and not self.estop.zeros  # zeros: see RobotEstop
             if can_hold_all and not self.unconfirmed:
                 self.confirmed_s = now - self._began
         elif self.unconfirmed and (self._order.hold or not self._settled):
@@ -168,7 +168,7 @@ class RobotStop:
                 self._began = now
             self.next = max(now, self._sent_at + REPEAT_S)
         if self.confirmed_s is not None and not self._settled:
-            self._settled = all(map(self._survives, self.estop.owners))
+            self._settled = all(map(self._survives, self.estop.owners))  # no save is awaited any more
 
     def _take_retained(self, message: Message) -> None:
         with suppress(PayloadError, ValueError, RecursionError):

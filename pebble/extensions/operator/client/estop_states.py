@@ -15,7 +15,7 @@ class Reset:
         """Store the states to reset: those that ``robot`` has received until now."""
         self.robot = robot
         self.shown = robot.latched
-        self._by = stop_of({"by": by})[1]
+        _, self._by, _ = stop_of({"by": by})  # as motor owners read it: short printable ASCII
 
     def messages(self) -> list[Message]:
         """Return the messages to publish, once: one for each stopped owner."""

@@ -83,10 +83,10 @@ def base_of(robot: str) -> str:
     """
     levels = robot.split("/")
     if len(levels) == 1:
-        levels = [*_USUAL.split("/")[:2], robot]
+        levels = f"{_USUAL}{robot}".split("/")
     if len(levels) != 3:
         raise NamingError(f'--robot {robot}: give its id, or "system/type/id"')
-    return Identity(*map(composed, levels)).base
+    return Identity(*map(composed, levels)).base  # composed: an accent may come as a character of its own
 
 
 def spellings(base: str) -> list[str]:

@@ -40,12 +40,12 @@ class Liveness:
         self._returns: deque[float] = deque(maxlen=2)  # when a heartbeat came after people had been told of a silence
 
     def heartbeat(self, now: float, latency_s: float, *, online: bool = True, t: int = 1) -> None:
-        """Note a heartbeat with the time ``t``, in milliseconds of the component's clock."""
+        """Note a heartbeat with the time ``t``, in milliseconds of the component's clock (1: not on a whole second)."""
         self._stamps.append(t)
         interval_s = None if self.received_at is None else now - self.received_at
         # shorter than any config allows: both heartbeats waited in a queue; longer: a pause, which is no interval
         if interval_s is not None and 0.05 <= interval_s <= 10.0:
-            if not self.reported_offline and self.online_to_people(now) is False:  # back from a silence alone
+            if not self.reported_offline and self.online_to_people(now) is False:  # it was only silent
                 self._returns.append(now)
             self._intervals.append(interval_s)
         has_plausible_clock = -1.0 <= latency_s <= 10.0
@@ -110,7 +110,7 @@ class RobotView:
         self.remembered: dict[str, Message] = {}  # by topic: what an emergency stop that begins later needs to know
         self.capabilities: dict[str, Any] = {}
         self.parked = False  # its broker retains a drive command: it moves a board whenever that connects
-        self._status = b""  # the newest
+        self._status = b""  # the payload of its newest status
         self.link: LinkState | None = None  # what the way to its broker carries; None: everything
         self.autonomy: AutonomyStatus | None = None
         self.volts: float | None = None
@@ -331,7 +331,7 @@ class RobotView:
             online=self.online(now),
             latched=self.latched,
             free_s=now - self.reset_at,
-            published=bool(self.capabilities) or self.estop.has_capabilities,
+            published=bool(self.capabilities) or self.estop.has_capabilities,  # also assumed; its own even if empty
             drives=self.drives,
             arbitrates=self.arbitrates,
             script=bool(self.script),

@@ -204,7 +204,7 @@ def _repeat(target: Target, bases: list[str], sender: StopSender, outbox: _Outbo
             report.update(time.monotonic())
             if others is not None:
                 others.look(time.monotonic())
-        # by the robot's status the report says whether the motors obey: it may come after the confirmation
+        # wait for the robot's status, which may come last: by it the report says whether the motors obey
         subscribing.join(_ANSWER_S)
         wait_for(lambda: second.state is State.CONNECTED, _ANSWER_S)
         _receive(listener, sender, _ON_ITS_WAY_S)
@@ -464,9 +464,9 @@ def _viewed(transport: Transport, receiving: Transport, names: Names) -> RobotVi
         return base == robot.base and robot.named
 
     put_account_into_topics(transport, names, is_named)
-    # for ``view.pace`` and ``view.driveable``, the longer one where it delays no answer; times do not matter
+    # LINK is for ``view.pace``, STATUS for ``view.driveable``: the longer one, on the connection without answers
     for channel, connection in ((LINK, receiving), (STATUS, transport)):
-        take = partial(view.receive, channel, now=0.0, wall=0.0)
+        take = partial(view.receive, channel, now=0.0, wall=0.0)  # neither depends on the time
         connection.subscribe(channel.topic(robot.base), take, direct=True)
     receiving.ask(robot.missing)  # stop states: the capabilities that list the owners may just have come
     wait_for(lambda: not robot.missing, _ANSWER_S)

@@ -41,6 +41,8 @@ def with_target(*, program: str = "tool", robot: bool = False) -> Callable[[Call
     options = (*_CONNECTION, *(_ROBOT if robot else ()), *_REMOTE)
 
     def decorate(command: Callable[..., int]) -> Callable[..., int]:
+        """Return ``run``, which has these options in the place of ``target``, and calls ``command``."""
+
         @functools.wraps(command)
         def run(**given: Any) -> int:
             from pebble.extensions.operator.client.connection import (
@@ -53,7 +55,7 @@ def with_target(*, program: str = "tool", robot: bool = False) -> Callable[[Call
             target = {option.name: given.pop(option.name) for option in (*options, *_CREDENTIALS)}
             return command(**given, target=Target(**target, program=program))
 
-        signature = inspect.signature(command, eval_str=True)  # typer makes its options from this
+        signature = inspect.signature(command, eval_str=True)  # typer reads run.__signature__ and run.__annotations__
         declared = list(signature.parameters.values())
         at = list(signature.parameters).index("target")
         parameters = [*declared[:at], *options, *declared[at + 1 :], *_CREDENTIALS]

@@ -179,7 +179,7 @@ def pub(
 
         moves_robot = names.channel(message.topic) is DRIVE and moves(message.payload)
         stoppable = robot_of_message() if moves_robot and not force else None
-        if not force:
+        if not force:  # with it, the topic stays as it was typed
             put_account_into_topics(transport, names, is_named)
         repetitions = 1 if rate is None else count or sys.maxsize
         for number in range(repetitions):

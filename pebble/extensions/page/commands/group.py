@@ -132,6 +132,7 @@ def register(app: typer.Typer) -> None:
 
 
 def _settings_of_url(broker: MqttSettings, options: dict[str, Any], folder: Path | None) -> WebSettings:
+    """Return the settings of a page without a config; people log in, unless only this machine reaches it, by http."""
     from pebble.extensions.page.setting import WebSettings
 
     settings = WebSettings(**{"broker": broker, "people": default_folder() / PEOPLE, **options})

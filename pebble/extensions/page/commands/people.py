@@ -137,11 +137,13 @@ def default_folder() -> Path:
 
 
 def _file(config: Path | None, people: Path | None) -> Path:
-    """Return the named database, or that of the page served by this machine's robot, or the user's own."""
-    if people is None and config is None:
+    """Return ``people``; without it the database of ``config``'s page, of this machine's robot's, or the user's own."""
+    if people is not None:
+        return people.absolute()
+    if config is None:
         config = _config_of_machine()
-    if people is not None or config is None:
-        return (people or default_folder() / PEOPLE).absolute()
+    if config is None:
+        return (default_folder() / PEOPLE).absolute()
     loaded = load(config)
     return loaded.section(WebInterface).people or loaded.state_dir() / PEOPLE
 

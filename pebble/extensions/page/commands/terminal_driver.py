@@ -108,10 +108,10 @@ class TerminalDriver:
         clock.echo(clock.ping(now), 1000 * now, now)
         view = self._driven.shown(self._tab, now)
         self._asked = (view.by if view.asking else "") or self._asked
-        may_request = self.robot.situation(now).published
+        may_request = self.robot.situation(now).published  # its capabilities are known
         if view.keeps:  # the robot itself decides who drives: nothing is requested before it has published who does
             may_request = self._driven.published is not None
-        if self._willing and may_request and not view.by and not view.asking:
+        if self._willing and may_request and not view.by and not view.asking:  # by: who has control
             self._take(now, over=False)
         self._out += self._driven.update(now)
         self._reason = f"no connection: {problem}" if problem else self._why_not(now)
@@ -180,7 +180,7 @@ class TerminalDriver:
         self._pressed = moves or (self._pressed and now - self._key_at < HELD_S)
         if moves or self._driven.state is State.MOVING:
             op = DriveOp(ref=self.robot.base, g=self._gesture, t=1000 * now, x=x, z=z, y=y)
-            self._out += self._driven.drive(self._tab, op, now, self._reason)[0]
+            self._out += self._driven.drive(self._tab, op, now, self._reason)[0]  # without why, if it is refused
 
     def _why_not(self, now: float) -> str:
         """Return why the robot cannot be driven; empty if it can."""

@@ -339,10 +339,10 @@ class DrivenRobot:
         # ``decided`` is the present key of control: empty if control is lost, another one if it was given once more.
         if had_control and client.decided != self._given_key:
             commands = self._on(Event.LOST, now)
-        if client.held and self.client is not client:
+        if client.held and self.client is not client:  # for the first time, or after the loss above
             commands += self._give(tab, client, now)
             wish.granted()
-        if client.failed:
+        if client.failed:  # why the request has failed
             if not had_control:  # a page that loses control is shown the new driver instead
                 wish.failed(client.failed)
             client.failed = ""
@@ -389,10 +389,10 @@ class DrivenRobot:
     def _zero(self, tab: Tab, op: DriveOp, now: float) -> list[Command]:
         """Return a zero to publish, which is sent in every state. It ends this gesture and the page's earlier ones."""
         tab.end_until(op.g)
-        if tab.moves is self and op.g >= tab.gesture:
+        if tab.moves is self and op.g >= tab.gesture:  # it moves by one of these gestures
             self._on(Event.LETS_GO, now)
         commands = tab.interrupt(op.g, now)  # zeros of another robot, if the page moves that by this gesture
-        if self._is_assumed:  # while such a board connects anew, only a later zero stops it
+        if self._is_assumed:  # a silent board that connects anew is stopped only by a zero after that
             self._repeat_zeros(now)
         # Unless it is ``final`` (see DriveOp), the driver has let go: an interrupted script may resume.
         is_release = self.tab is tab and not op.final

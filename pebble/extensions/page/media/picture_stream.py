@@ -64,7 +64,7 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
             elif answer == _CANNOT_DECODE:
                 viewer.queue.cannot_decode(frame.encoding)
         viewer.wakeup.set()
-        if answer:
+        if answer:  # it was not drawn: a key frame, or another encoding, may have to be requested
             self._request.wake()
 
     # -- pictures

@@ -43,8 +43,8 @@ class RescueStream:
 
     def __init__(self, ready: Callable[[RescuedPicture], None]) -> None:
         self._ready = ready
-        self._pending: list[bytes] = []
-        self._fed = asyncio.Event()
+        self._pending: list[bytes] = []  # payloads to be decoded, in order
+        self._fed = asyncio.Event()  # there are such
         self._task: asyncio.Task[None] | None = None
 
     def start(self, chain: Sequence[bytes]) -> None:

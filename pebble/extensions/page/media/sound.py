@@ -85,10 +85,10 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
 
     def __init__(self, broker: Broker, robots: Robots, ref: str, note: NoteTalk) -> None:
         super().__init__(broker, robots, ref, "audio", "web/sound", _AT_REST)
-        self._voice = Voice()
-        self._note_talk = note
-        self._talk: Talk | None = None
-        self._talker: SoundPage | None = None
+        self._voice = Voice()  # makes packets of a talk
+        self._note_talk = note  # for the audit
+        self._talk: Talk | None = None  # the present one
+        self._talker: SoundPage | None = None  # whose talk it is
 
     def leave(self, viewer: SoundPage) -> None:
         super().leave(viewer)
@@ -110,10 +110,11 @@ class SoundStream(MediaStream[SoundPage, SoundView]):
     def receive_voice(self, page: SoundPage, talk: int, piece: int, sound: bytes) -> None:
         """Handle 20 ms of a page's voice. The first piece begins a talk, if that is allowed."""
         now = time.monotonic()
-        self._end_silent_talk(now)  # perhaps this one
-        if talk <= page.last_ended:
+        self._end_silent_talk(now)  # perhaps the talk of this very piece
+        if talk <= page.last_ended:  # a late piece of a talk that has ended must not begin it again
             return
-        if self._talk is None or page is not self._talker or talk != self._talk.number:
+        is_of_this_talk = self._talk is not None and page is self._talker and talk == self._talk.number
+        if not is_of_this_talk:
             if why := self._why_not(page):
                 page.answer(talk, on=False, why=why)
                 return

@@ -22,9 +22,9 @@ class Talk:
         self._begun_at = float("inf")  # when the page spoke piece 0, as the fastest of its pieces shows
 
     def takes(self, piece: int, now: float) -> bool:
-        """True if piece number ``piece`` of the microphone, from 0, is at most LATE_S later than the fastest one."""
+        """True if piece number ``piece``, from 0, is at most LATE_S later than the fastest; if so, note its time."""
         begun_at = now - piece / PIECES_PER_S  # when the page spoke piece 0, if this piece was not delayed
-        # A slow microphone moves that time on with each piece, although no piece is delayed: it may, by _DRIFT_S.
+        # The pieces of a slow microphone come ever later: so the fastest counts as later by _DRIFT_S with each piece.
         self._begun_at = min(self._begun_at + _DRIFT_S, begun_at)
         if begun_at - self._begun_at > LATE_S:
             return False

@@ -153,13 +153,13 @@ class PlayedRobot:
         self._replayed = f"{SYSTEM}/{ref.partition('/')[2]}"  # the base of the topics that pages see
 
     def send(self, message: Recorded, _position_ns: int) -> bool:
-        """Send a recorded message, or keep it for the next flush."""
+        """Send a recorded message, or keep it for the next flush; return True, as it is never refused."""
         at_ns, newest_ns = message.log_ns, self._newest_ns
         if at_ns - newest_ns > _GAP_NS:
             self._show(skipped=(newest_ns / 1e6, at_ns / 1e6))
         self._newest_ns = max(newest_ns, at_ns)
         metric, incoming = metric_of(message.channel.topic)
-        if incoming:
+        if incoming:  # pages show what the robot has published
             return True
         if is_media(message.payload):
             self._take_medium(message)
@@ -224,7 +224,8 @@ class PlayedRobot:
         position_ms = self.player.position_ns / 1e6
         rests = self.player.paused and not self._is_new  # after a seek even a paused player has something to show
         is_position_due = not rests and now - self._played_at >= _PLAYED_S
-        if is_position_due or rests != self._rested:  # the page knows another state than the present one
+        knows_state = rests == self._rested  # the page was told whether the player rests now
+        if is_position_due or not knows_state:
             self._rested = rests
             self._show()
         if not rests and now - self._liveness_at >= _LIVENESS_S and self._robot.live:

@@ -87,7 +87,7 @@ class Recordings:
         self.process = ArchiveProcess(folder)
         self.viewers = Viewers(folder)
         self._scratch = tempfile.TemporaryDirectory(prefix="pebble-replay-")
-        self._timelines: dict[tuple[str, str], _Timeline] = {}
+        self._timelines: dict[tuple[str, str], _Timeline] = {}  # by day and robot, the last used at the end
         self._export: _Export | None = None
 
     @property

@@ -148,6 +148,7 @@ def _lane(path: Path) -> str:
 
 
 def _state(info: FileInfo) -> str:
+    """Return what distinguishes a file from a finished, undamaged one, the most telling of it; "" if nothing does."""
     if info.is_active:
         return "being written"
     if info.missing:
@@ -165,9 +166,9 @@ def _print_events(paths: Iterable[Path]) -> None:
     if events:
         typer.echo("\nWhat happened to the recording:")
     for event in events:
-        name, at = event.pop("event"), event.pop("t", 0)
-        since, until = event.pop("since", None), event.pop("until", None)
-        if isinstance(since, int) and isinstance(until, int):
-            event["lasted"] = show.duration(max(0.0, (until - since) / 1e3))
+        name, at_ms = event.pop("event"), event.pop("t", 0)
+        since_ms, until_ms = event.pop("since", None), event.pop("until", None)
+        if isinstance(since_ms, int) and isinstance(until_ms, int):
+            event["lasted"] = show.duration(max(0.0, (until_ms - since_ms) / 1e3))
         details = one_line(", ".join(f"{key} {value}" for key, value in event.items()))
-        typer.echo(f"  {local_time(at * 10**6)}  {shown(f'{name}: {details}')}")
+        typer.echo(f"  {local_time(at_ms * 10**6)}  {shown(f'{name}: {details}')}")

@@ -132,7 +132,7 @@ class _Playing:
         return player
 
     def _wait(self, seconds: float, player: Player, robots: ReplayedRobots) -> None:
-        """Wait; print each change of the connection's state."""
+        """Wait; print each change of the connection's state, and end the replay if a signal has come."""
         time.sleep(seconds)
         if robots.problem != self._problem:
             self._problem = robots.problem

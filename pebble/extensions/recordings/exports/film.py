@@ -142,9 +142,9 @@ class _Pictures:
             self.last_ms = frame.pts = max(at_ms, self.last_ms + 1)
             frame.time_base = _MILLISECOND
             self.count += 1
-            yield from _lasting(stream.encode(frame))
+            yield from _with_durations(stream.encode(frame))
         if stream is not None:
-            yield from _lasting(stream.encode(None))
+            yield from _with_durations(stream.encode(None))
 
     def _opened(self, height: int, width: int) -> Any:
         """Open the encoder for the first picture's size, rounded down to even numbers.
@@ -160,7 +160,7 @@ class _Pictures:
         return stream
 
 
-def _lasting(packets: list[Any]) -> list[Any]:
+def _with_durations(packets: list[Any]) -> list[Any]:
     """Return the packets, each with a duration.
 
     Only the last one's duration counts: the others are shown until the next.

@@ -52,7 +52,7 @@ class _Export:
         self._copy, self._schemas = copy, schemas
         self._media = Media(schemas)
         self._telemetry = Telemetry(schemas)
-        self._channels: dict[str, Channel] = {}
+        self._channels: dict[str, Channel] = {}  # of converted messages, by topic
 
     def add(self, message: Recorded) -> None:
         topic, payload = message.channel.topic, message.payload

@@ -82,7 +82,7 @@ class RecordingFile:
         self.is_ours = True  # written by Pebble, which numbers messages; also if a damaged header does not tell
         self.statistics: Statistics | None = None  # None: the file is not finished, or its summary is incomplete
         self._schemas: dict[int, Schema] = {}
-        self._metadata: list[int] = []  # positions of these records
+        self._metadata: list[int] = []  # positions of the records of metadata
         self._scan = Scan(self._read, self.damage)
         self._recent = lru_cache(_KEPT)(partial(self._unpacked, chooses=lambda _channel: True))
         try:
@@ -159,7 +159,7 @@ class RecordingFile:
         expected = 0 if len(chunks) == len(self.chunks) else None  # number of the next message; None: some are skipped
         for chunk in chunks:
             messages, numbers = self._unpacked(chunk, chooses)
-            if numbers is not None:
+            if numbers is not None:  # sequence numbers, which count all messages of the file, chosen or not
                 first, last = numbers
                 if expected is not None and self.statistics is None:  # without a summary only this gap shows the loss
                     self.damage.missing += max(0, first - expected)
@@ -270,7 +270,10 @@ class RecordingFile:
     # -- both
 
     def _unpacked(self, chunk: Chunk, chooses: Chooses) -> tuple[list[Recorded], tuple[int, int] | None]:
-        """Return the chosen messages of a chunk, and the sequence numbers of its first and last message."""
+        """Return the chosen messages of a chunk, and the sequence numbers of its first and last message.
+
+        None in place of the numbers: the chunk is damaged, or has no message.
+        """
         messages: list[Recorded] = []
         first, last = -1, -1
         chosen: dict[int, Channel | None] = {}  # by channel number; None: not chosen

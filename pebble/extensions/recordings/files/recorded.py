@@ -78,7 +78,7 @@ class Damage:
     def report(self, *, active: bool = False) -> str:
         """Return the damage in words; "" if there is none.
 
-        A file that is ``active`` (being written) needs no end. A file may also be written without that being known.
+        ``active``: the file is known to be written now, so it needs no end. Any other without an end may be, too.
         """
         reasons = [
             (len(self.parts), f"{len(self.parts):,} damaged parts"),

@@ -70,7 +70,7 @@ def unpack_chunk(data: bytes) -> bytes:
 
 
 def record_of(data: bytes) -> McapRecord:
-    """Return the parsed record. Raises DamageError, also for lengths that do not fit exactly (but not of a Chunk)."""
+    """Return the parsed record. Raises DamageError, also for lengths that do not fit (a Chunk has a checksum)."""
     from mcap.data_stream import RecordBuilder
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader

@@ -92,7 +92,7 @@ class Scan:
         if op == Op.CHUNK:
             is_valid = self._is_chunk(at, length)
         elif op == Op.MESSAGE_INDEX:
-            index_head = self._read(at + HEAD.size, _INDEX.size)
+            index_head = self._read(at + HEAD.size, _INDEX.size)  # [1]: the length of the entries behind it
             is_valid = length >= _INDEX.size and length == _INDEX.size + _INDEX.unpack(index_head)[1]
         else:
             is_valid = self._is_exact(at, length)

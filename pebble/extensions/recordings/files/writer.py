@@ -88,7 +88,7 @@ class RecordingWriter:
         named, self._new = self._new, []
         if self._log_ns >= self._names_again_ns:
             named, self._names_again_ns = self._named, self._log_ns + _NAMES_AGAIN_NS
-        if named and self.messages:  # no message, no chunk; at the first message all channels are declared again
+        if named and self.messages:  # not before the first message: its time makes all channels due again
             self._output.write(_packed(named))
         self._writer.flush()
         self.indexed += len(self._used)

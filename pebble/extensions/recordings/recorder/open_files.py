@@ -72,7 +72,10 @@ class OpenFiles:
         return lane if lane == STATE or lane in self._files or media < _MOST_MEDIA else OTHER_MEDIA
 
     def get(self, lane: str, *, now_ns: int, at_ns: int) -> OpenFile:
-        """Return a lane's file; a new one begins with the values retained at ``at_ns``. Raises OSError."""
+        """Return a lane's file. Raises OSError.
+
+        A new one is named after ``now_ns``. If it is of the state, it begins with the retained values, as of ``at_ns``.
+        """
         file = self._files.get(lane)
         if file is not None:
             return file

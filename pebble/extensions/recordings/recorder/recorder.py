@@ -81,9 +81,10 @@ class Recorder:
     ) -> None:
         """Queue a message. ``retained``: an old value, which the broker sent for a new subscription.
 
-        ``qos``, ``retain``: as it was published; None if unknown.
+        ``qos``, ``retain``: as it was published; None if unknown. ``source``: the name of its connection, if there are
+        several.
         """
-        if topic.startswith("$recorder/") or len(payload) > LARGEST_PAYLOAD:
+        if topic.startswith("$recorder/") or len(payload) > LARGEST_PAYLOAD:  # such topics are the recorder's own
             self.counters["refused"] += 1
         elif self.options.media or not is_media(payload):
             self._intake.add(topic, payload, qos, retain, "1" if retained else "", source)  # see Item.retained
@@ -132,14 +133,14 @@ class Recorder:
         if flushing:
             self._writing.note_drops()
         if stopping:
-            self._writing.try_again()
+            self._writing.try_again()  # if files could not be written
         for item in self._intake.take():
             self._writing.add(item)
         if flushing:
             self._writing.flush()
             self._writing.rotate(all_of_them=stopping)
         if stopping:
-            self._writing.give_up()
+            self._writing.give_up()  # what still cannot be written
 
     def _follow_clock(self, due: Due) -> None:
         suspended_s = due.suspended_s(self._clocks.awake_ns())

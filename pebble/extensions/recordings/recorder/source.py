@@ -119,15 +119,16 @@ class Source:
             self._recorder.note("lost", why=self.problem, **self._about)
 
     def _receive(self, message: Message) -> None:
+        """Record a message; an old one only where no second connection fetches those."""
         if message.topic.startswith(self._ignored):
             return
-        # With as_published the flag says nothing, but the broker was told to send no old values, see _make.
+        # A retain flag marks an old value; not with as_published, but then the broker sends none, see _make.
         is_live = self._transport.as_published or not message.retain
         if is_live:
             self._recorder.receive(
                 message.topic, message.payload, int(message.qos), message.retain_requested, source=self._name
             )
-        elif self._kind != "mqtt":  # those of a broker are fetched by the other connection
+        elif self._kind != "mqtt":  # see _RetainedFetch
             self._record_retained(message)
 
     def _record_retained(self, message: Message) -> None:
@@ -149,7 +150,7 @@ class _RetainedFetch:
         self._transport = create("mqtt", "pebble-recorder-retained", plain)
         self._transport.on_state(self._watch)
         self._transport.open(0.0)
-        for filter_, receive in _once(filters, self._receive):
+        for filter_, receive in _once(filters, self._receive):  # each message counts once
             self._transport.subscribe(filter_, receive, direct=True)
 
     @property

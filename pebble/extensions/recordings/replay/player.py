@@ -253,9 +253,9 @@ class Player:
         elif due_s > _NOW_S:
             self._pass(min(due_s, _TICK_S))
             return
-        if due_s < -_LATE_S:  # too late to catch up
+        if due_s < -_LATE_S:  # too late to catch up; never after a long pause, as due_s is positive then
             self._pace.go_on_from(message.log_ns)
-        if self._send(message, message.log_ns):
+        if self._send(message, message.log_ns):  # else it is tried again
             self._reading.advance()
 
     def _send(self, message: Recorded, position_ns: int) -> bool:

@@ -87,10 +87,10 @@ class Rules:
         address = self._listed(recorded.channel)
         if address is None or _is_probe(recorded.payload):
             return None
-        payload, moves = recorded.payload, None
+        payload, moves = recorded.payload, None  # moves: None if it is no drive command
         if address.declared is c.DRIVE:
             moves = self._moves(payload)
-            if moves is None:
+            if moves is None:  # a drive command that must not be sent
                 return None
         if address.declared is c.CAPABILITIES and payload:
             payload = harmless(payload, address.recorded.base, address.base)

@@ -173,7 +173,7 @@ class _Rows:
             medium = PICTURE
         elif channel in self._heartbeats:
             online = int(_OFFLINE.search(payload) is None)
-        shown = Activity.MEDIA if medium else activity(payload)
+        shown = Activity.MEDIA if medium else activity(payload)  # the use of the robot that it shows
         self._batch.append((channel, message.log_ns, stamp, len(payload), medium, shown, online))
 
     def _declare(self, channel: Channel) -> Callable[[bytes], Activity]:

@@ -244,11 +244,11 @@ class HallWheel:
         return tracker, counts
 
     def _add(self, sample: HallSample, tracker: PhaseTracker, counts: _Counts) -> None:
-        """Add the motion of a sample to the counts, by both sensors if the second one is used."""
+        """Add a sample's motion, as ``tracker`` finds it, to ``counts``; by both sensors if the second one is used."""
         level = self._range.level(sample.value)
         if self._second_sign and sample.quadrature is not None:
             second = self._second_sign * self._second.level(sample.quadrature)
-            added = tracker.update_pair(math.atan2(level, -second), sample.power)
+            added = tracker.update_pair(math.atan2(level, -second), sample.power)  # see _sign_of_second
         else:
             added = tracker.update(level, sample.power)
             if sample.direction == 0:  # which one sensor alone does not show

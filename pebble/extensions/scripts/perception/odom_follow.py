@@ -54,7 +54,7 @@ class OdomFollower:
         self._vision = Follower(replace(settings, tag_timeout_s=0.0))  # how old a place may be is decided here
         self._place: Place | None = None  # of the tag in the newest picture
         self._goal: tuple[float, float] | None = None  # x and y to which the robot drives while the tag is out of sight
-        self._seen_at = self._planned_at = self._reached_at = float("-inf")
+        self._seen_at = self._planned_at = self._ended_at = float("-inf")  # ended: a goal was reached, or took too long
 
     def see(self, now: float, place: Place | None, pose: Pose | None) -> None:
         """Note the tag's place (None: not in the picture), and the pose at that time, if known."""
@@ -73,7 +73,7 @@ class OdomFollower:
             blind = self._to_goal(now, self._goal, pose)
             if blind is not None:
                 return blind
-        if now - self._reached_at < self.settings.goal_hold_s:
+        if now - self._ended_at < self.settings.goal_hold_s:
             return Command(reason="goal reached")
         return vision
 
@@ -92,7 +92,7 @@ class OdomFollower:
         dx, dy = goal[0] - pose.x_m, goal[1] - pose.y_m
         distance = math.hypot(dx, dy)
         if distance <= settings.odom_goal_tolerance_m or now - self._planned_at > _BLIND_S:
-            self._goal, self._reached_at = None, now
+            self._goal, self._ended_at = None, now
             return None
         off_rad = math.remainder(math.atan2(dy, dx) - pose.heading_rad, math.tau)  # > 0: to the left
         steering = max(-1.0, min(1.0, settings.odom_heading_kp * off_rad / (math.pi / 2)))

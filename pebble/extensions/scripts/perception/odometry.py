@@ -215,7 +215,7 @@ class Odometry:
         self.pose = part.end(self._base)
         is_ready = self._left.hall.ready and self._right.hall.ready
         if is_ready:  # no warm-up of a sensor can correct the part any more
-            if self.moving(now) or not self._was_ready:  # at rest it is noise; after a warm-up, the whole way
+            if self.moving(now) or not self._was_ready:  # at rest, motion is noise; that of a warm-up counts
                 self.distance_mm += abs(part.ahead_mm)
             self._base, self._part = self.pose, _Part()
         self._was_ready = is_ready

@@ -106,9 +106,9 @@ class DriveSender:
         self._owners = {**remembered, **states}  # an owner that is gone for a while may come back restarted
         latched = [state for state in states.values() if state.latched]
         self._latched = max(latched, key=lambda state: state.since, default=None)
-        last_barred = [state.last_barred for state in states.values()]
-        barring = [run for run in last_barred if not newer(self.run, run)]  # this one or newer: they bar it
-        if any(run != self.run for run in barring):  # a newer one is barred: so it has begun
+        last_barred = [state.last_barred for state in states.values()]  # an owner bars all runs up to that number
+        barring = [run for run in last_barred if not newer(self.run, run)]  # this run, or newer: they bar it
+        if any(run != self.run for run in barring):  # beyond this run: so a newer one has begun
             self._superseded = True
         elif barring and self._barred_at is None:
             self._barred_at = now

@@ -39,7 +39,10 @@ class Guard:
         os._exit(128 + number)
 
     def _next(self, timeout: float | None) -> int:
-        """Return the next signal that ends the script. With ``timeout`` only Ctrl-C counts; 0 if it does not come."""
+        """Return the next signal that ends the script.
+
+        ``timeout``: how long to wait for Ctrl-C alone, after another signal; 0 if it does not come.
+        """
         wanted = _NUMBERS if timeout is None else (signal.SIGINT,)
         while True:
             readable, _, _ = select.select([self._reader], [], [], timeout)

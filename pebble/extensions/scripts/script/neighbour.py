@@ -43,7 +43,7 @@ class Neighbour:
         self._moves = False  # the newest command moves it
         self._over = False  # the script has ended
         self._lock = threading.Lock()  # else the last command might come after the final zero
-        own.latest_there(NEIGHBOURS, PRESENT_S)  # subscribes
+        own.latest_there(NEIGHBOURS, PRESENT_S)  # the first call subscribes; nothing has arrived yet
 
     @property
     def online(self) -> bool:

@@ -154,6 +154,7 @@ def _add(parser: argparse.ArgumentParser, setting: Setting) -> None:
     if setting.type == "bool":
         help_ = f"{setting.label} (default: {'on' if setting.default else 'off'})"
         action = argparse.BooleanOptionalAction
+        # default=None: if the option is not given, `parse` leaves the default to the Struct.
         parser.add_argument(str(setting.arg), dest=setting.key, action=action, default=None, help=help_)
         return
     parser.add_argument(

@@ -147,7 +147,7 @@ def _arguments(
         "--describe", action="store_true", help="print the form that operators see, as JSON; only alone"
     )
     chosen, values = parse(options or _NoOptions, sys.argv[1:], parser)
-    if values.describe:  # and something else: alone, `run` has handled it
+    if values.describe:  # not as the only word, which `run` has handled before
         parser.error("--describe goes alone: it prints the form and starts nothing")
     if values.config is None:
         parser.error("which robot? Add its config file, for example: --config goob.json")
@@ -166,7 +166,7 @@ class _Program:
         self._robot: Robot | None = None
 
     def run(self, main: Callable[..., None], config_path: Path, arguments: tuple[msgspec.Struct, ...]) -> None:
-        Guard(self._end_on_signal)
+        Guard(self._end_on_signal)  # its own thread ends the run at a signal
         config = load(config_path, lenient=True)  # as the launcher does, which runs the robot
         LocalScripts(config).hold()  # until the process ends
         transport = _connected(config, config_path)
@@ -192,10 +192,13 @@ class _Program:
 
 
 def _connected(config: Config, path: Path) -> Transport:
-    """Return the open local transport. Raises PebbleError that names what is missing, for a script run in a shell."""
+    """Return the open local transport. Raises PebbleError that names what is missing, for a script run in a shell.
+
+    A script of the manager, which sets RUN, goes on without a connection: the transport makes one when it can.
+    """
     transport = local_transport(config, f"script-{os.getpid()}")
     transport.open(_CONNECT_S)
-    if transport.state is not State.CONNECTED and RUN not in os.environ:  # RUN: the manager of scripts sets it
+    if transport.state is not State.CONNECTED and RUN not in os.environ:
         why = transport.problem or f"no answer within {_CONNECT_S:g} s"
         transport.close()
         raise TransportError(f"{config.identity.id} is not up ({why}): start it with `pebble up {path}`")

@@ -202,8 +202,8 @@ class Robot:
             if section is None or not section.enabled or name not in section.listens:
                 raise PebbleError(f'robot.neighbour: {name!r} is not in services.neighbours.listens: add "{name}": []')
             latest = _Latest(partial(self._subscribe_to, name), self._clock)
-            own = RobotParts(self._transport, self._wheels, latest.of, self._check, self._check_drives, self._clock)
-            neighbour = self._neighbours[name] = Neighbour(name, self.config.identity, own)
+            parts = RobotParts(self._transport, self._wheels, latest.of, self._check, self._check_drives, self._clock)
+            neighbour = self._neighbours[name] = Neighbour(name, self.config.identity, parts)
         return neighbour
 
     def sleep(self, seconds: float) -> None:

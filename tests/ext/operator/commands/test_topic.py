@@ -69,6 +69,19 @@ def test_retained_topics_are_listed_with_their_synonym_and_echoed_raw(at: tuple[
     assert run.out == '{"t": 1710969600123}\n'
 
 
+@pytest.mark.parametrize("words", [("topic", "echo", "capabilities", "-s", "5", "-n", "1", "-r"), ("estop", "status")])
+def test_a_robot_is_found_however_its_accents_are_spelled(run: Run, broker: Broker, words: tuple[str, ...]) -> None:
+    robot = RecordingRobot(broker.port, "pebble/robots/ba\u0308r", "serial", heartbeats=False)
+    try:
+        assert run(*words, "b\u00e4r", f"--url=mqtt://127.0.0.1:{broker.port}") == 0, run.err
+        assert run.out
+    finally:
+        robot.silent()
+        for metric in ("capabilities", "estop/serial"):
+            robot.remove(metric)
+        robot.close()
+
+
 def test_a_password_comes_from_a_file_or_the_environment(
     tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:

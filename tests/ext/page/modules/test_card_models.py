@@ -221,7 +221,7 @@ may = Script(
     {
         "ui/cards/autonomy-model.js": "whyNotStarted",
         "ui/parts/why-not.js": "whyNot, whyNotEnd",
-        "ui/parts/parts.js": "isGone",
+        "ui/parts/parts.js": "held, isGone",
     },
     _PAGE,
 )
@@ -262,6 +262,10 @@ MAY: Rows = {
     **{f"after {age} s of {period} s a value is gone: {gone}": (
         f"result = isGone({{ age: {1000 * age}, period: {1000 * period} }}, {json.dumps(online)});", gone)
         for age, period, online, gone in GONE},
+    "of the keys only Space and Enter hold a button, each once": ("""
+        let begun = 0; const { onKeyDown } = held(() => begun++, () => {}, true);
+        for (const code of ["KeyW", "Space", "Enter"]) [false, true].forEach((repeat) => onKeyDown({ code, repeat }));
+        result = begun;""", 2),
 }
 # fmt: on
 
@@ -303,8 +307,10 @@ ENTERED: list[tuple[dict[str, Any], Any, Any]] = [
 ]
 #: Fields, and the least and the greatest value, and the step.
 RANGES: list[tuple[dict[str, Any], Any, str]] = [
-    ({"type": "u8"}, [0, 255], "1"),
+    *[({"type": f"u{bits}"}, [0, 2**bits - 1], "1") for bits in (8, 16, 32)],
+    *[({"type": f"i{bits}"}, [-(2 ** (bits - 1)), 2 ** (bits - 1) - 1], "1") for bits in (8, 16, 32)],
     ({"type": "u8", "scale": 0.5}, [0, 127.5], "0.5"),
+    ({"type": "u8", "scale": 3}, [0, 765], "3"),
     ({"type": "i16", "scale": -0.1, "offset": 10}, [-3266.7, 3286.8], "any"),
     ({"type": "f32"}, None, "any"),
 ]
@@ -346,6 +352,9 @@ STREAMS = {
 CARDS: Rows = {
     "an interface that stays on the robot takes no commands": (
         of("unsendable(v[0].interfaces[0]).slice(0, 22)", described(PRIVATE)), "it takes commands from"),
+    **{f"what takes commands has fields of known types: {kind}": (
+        of("unsendable(v[0])", {"encoding": {"fields": [{"name": "x", "type": kind}]}}), why)
+        for kind, why in {**dict.fromkeys(("bool", "f32", "u8"), ""), "f64": "x is of an unknown type"}.items()},
     **{f"controls for an extra axis: {value}": (
         of("new Offers('pebble/robots/a', v[0]).hasExtraAxis", value and {"value": value}), expected)
         for value, expected in AXES},

@@ -11,11 +11,11 @@ import pytest
 from pebble.extensions.operator.client.drive_reasons import WORDS
 from tests.ext.page.in_node import STATIC, Rows, Script, evaluate, rows
 
-# -- gestures: what is sent is listed as [gesture, z, final]
+# -- gestures: what is sent is listed as [gesture, sum of the axes, final]; all but z are 0
 
 _GESTURE = """
 const sent = [];
-const gesture = new Gesture(({ g, z, final }) => sent.push([g, z, final]));
+const gesture = new Gesture(({ g, x, z, y, final }) => sent.push([g, x + z + y, final]));
 let now = 1000;
 const at = (z) => ({ x: 0, z, y: 0 });
 const step = (z, { wait = 50, allowed = true, neutral, waits } = {}) =>
@@ -232,14 +232,26 @@ REASONS: Rows = {
 # -- whose it is
 
 
-def test_a_stop_by_request_has_the_name_of_the_person() -> None:
+def test_a_stop_has_an_id_and_by_request_the_name_of_the_person_also_if_the_page_is_left() -> None:
     steps = """
-      const asked = [];
-      globalThis.fetch = async (url) => (asked.push(url), { ok: true });
-      new Estop({ send: () => false, you: { user: "Ann & Bo" } }).press("pebble/robots/goob");
-      result = asked.map((url) => url.replace(ROOT, "/"));
+      const asked = [], reached = [];
+      const answers = [() => ({ ok: true }), () => ({ ok: false }), () => { throw new Error("no connection"); }];
+      globalThis.fetch = async (...request) => (asked.push(request), answers.shift()());
+      for (const isSent of [true, false, false, false]) {
+        const estop = new Estop({ send: () => isSent, you: { user: "Ann & Bo" } });
+        estop.press("pebble/robots/goob");
+        reached.push([/^[0-9a-f]{16}$/.test(estop.pressed.stop), estop.pressed.reached]);
+        await new Promise((resolve) => setImmediate(resolve));
+        reached.at(-1).push(estop.pressed.reached);
+      }
+      const [[url, { keepalive }]] = asked;
+      result = [url.replace(ROOT, "/"), keepalive, reached];
     """
-    assert evaluate({"core/estop.js": "Estop", "core/browser.js": "ROOT"}, steps) == ["/api/estop?name=Ann%20%26%20Bo"]
+    assert evaluate({"core/estop.js": "Estop", "core/browser.js": "ROOT"}, steps) == [
+        "/api/estop?name=Ann%20%26%20Bo",
+        True,
+        [[True, True, True], [True, False, True], [True, False, False], [True, False, False]],
+    ]
 
 
 # -- actions: what is done is listed as [action, phase]
@@ -313,6 +325,26 @@ ACTIONS: Rows = {
 # fmt: on
 
 
+# -- what browsers lack, deny or take away
+
+denying = Script({"core/browser.js": "fullScreen, local", "core/browser-more.js": "isLoopback, microphone"})
+HERE = ["127.0.0.1", "0.0.0.0", "[::1]", "[::]", "localhost", "robots.localhost"]
+# fmt: off
+DENYING: Rows = {
+    "what it does not keep is remembered until the page is left": ("""
+        const kept = new Map(), setItem = (key, text) => text.length < 9 && kept.set(key, text);
+        globalThis.localStorage = { setItem, getItem: (key) => kept.get(key) ?? null };
+        result = ["short", "very long", "anew"].map((text) => [local.set("a", text), local.get("a")]);""",
+        [[True, "short"], [False, "very long"], [True, "anew"]]),
+    "what it denies is not offered": (
+        "result = [fullScreen.possible, fullScreen.on, microphone.possible];", [False] * 3),
+    "no other machine reaches some addresses": (
+        f"result = {[*HERE, '192.168.1.7', '127.0.0.1.nip.io', '[fd00::1]']}.map(isLoopback);",
+        [True] * len(HERE) + [False] * 3),
+}
+# fmt: on
+
+
 # -- mappings of gamepads
 
 _MAPPING = """
@@ -356,26 +388,47 @@ const lock = { released: false, release() { seen.push("off"); this.released = tr
 const request = async () => (seen.push("on"), Object.assign(lock, { released: false }));
 define("navigator", { wakeLock: { request } });
 define("setInterval", (run) => (later = run));
-const { install } = await import(given);
-const driver = { ref: "pebble/robots/goob", lease: {}, onChange() {} };
+define("fetch", async () => seen.push("reload"));
+const driver = { ref: "pebble/robots/goob", lease: {}, sliders: { speed: 0.5 }, changed() {}, onChange() {} };
 const panels = { toggle: (name) => seen.push(name) };
-const page = { driver, connection: { show() {} }, store: { get: () => undefined }, panels, commands: {} };
-install(page);
-page.sound = { toggleMute: () => seen.push("mute") };
+const connection = { isOpen: true, show() {}, socket: { send: () => false } };
+const page = { driver, connection, store: { get: () => undefined }, panels, commands: {} };
 const key = (code, key = code) => driver.actions.keyDown({ code, key, repeat: false });
 const turn = () => new Promise((resolve) => setImmediate(resolve));
 """
+_INSTALL = f"""
+const {{ install }} = await import("{(STATIC / "ui" / "more.js").as_uri()}");
+install(page);
+page.sound.model = {{ toggleMute: () => seen.push("mute") }};
+"""
 
 
-def test_behind_an_open_panel_there_is_only_the_help_and_the_screen_stays_on_while_this_page_has_control() -> None:
-    steps = """key("KeyM"); dialog = {}; key("KeyM"); key("Slash", "?"); await turn();
-    page.connection.isOpen = true; let you = false; page.store.get = () => ({ value: { you } });
-    for (you of [false, true, true, false, false, true]) { later(); await turn(); }
-    lock.released = true; later(); await turn(); result = seen;"""
-    module = (STATIC / "ui" / "more.js").as_uri()
-    assert evaluate({}, _MORE + steps, module) == ["mute", "help", "on", "off", "on", "on"]
+more = Script({}, _MORE + _INSTALL, "await turn();\nresult = seen;")
 
 
-@rows((gesture, GESTURE), (inputs, INPUTS), (reasons, REASONS), (actions, ACTIONS), (mapping, MAPPING))
+# fmt: off
+MORE: Rows = {
+    "behind an open panel there is only the help":
+        ('key("KeyM"); dialog = {}; key("KeyM"); key("Slash", "?");', ["mute", "help"]),
+    "the screen stays on while this page has control": ("""
+        let you = false; page.store.get = () => ({ value: { you } });
+        for (you of [false, true, true, false, false, true]) { later(); await turn(); }
+        lock.released = true; later();""", ["on", "off", "on", "on"]),
+    "keys change the speed": ("""
+        for (const [code, times] of [["NumpadAdd", 1], ["NumpadAdd", 9], ["Minus", 1], ["Minus", 9]]) {
+          for (let n = 0; n < times; n++) key(code, code === "Minus" ? "-" : "+");
+          await turn(); seen.push(driver.sliders.speed);
+        }""", [0.6, 1, 0.9, 0.05]),
+    "a command that was not sent has no number": ("seen.push(page.commands.setLights(driver.ref, {}));", [0]),
+    "a page that a person uses is not loaded anew by itself": (
+        "connection.isOld = true; for (const now of [1e6, 2e6]) { performance.now = () => now; later(); }", []),
+}
+# fmt: on
+
+
+@rows(
+    (gesture, GESTURE), (inputs, INPUTS), (reasons, REASONS), (actions, ACTIONS), (denying, DENYING),
+    (mapping, MAPPING), (more, MORE),
+)  # fmt: skip
 def test_each(found: Callable[[], Any], expected: Any) -> None:
     assert found() == expected

@@ -1,4 +1,4 @@
-"""The page's driver with events, gamepads and a socket that are made up, and the end of a session; in Node.js."""
+"""The page's driver with made-up events, gamepads and a socket, and the connection to the server; in Node.js."""
 
 from __future__ import annotations
 
@@ -285,6 +285,12 @@ SHOWN: Rows = {
     "a gamepad that stands still while it is deflected is given up and reported": ("""
         const frozen = real(1); show(real(0)); pass(2500, frozen); result = [driver.output.z];
         pass(1000, frozen); result.push(driver.output.z, driver.reason().code);""", [0.6, 0, "pad"]),
+    "who loses control learns to whom, and how long it was not used": ("""
+        const lost = [], of = (view) => { store.set(REF, "web/driver", view); show(); };
+        driver.lease.onLost = (...why) => lost.push(why); of({ you: true, by: "anna", idle_s: 3 });
+        socket.state = "lost"; of({ you: false, by: "bob" }); result = [lost.length];
+        socket.state = "open"; show(); store.drop(REF, "web/driver"); show();
+        result.push(lost, driver.failed.size);""", [0, [["bob", 3000]], 0]),
     "a gamepad in another window is reported and its stop counts": ("""
         document.hasFocus = () => false; show(real(0)); show(real(1)); result = [codes(), driver.output.z];
         show(real(1, 8, 9)); result.push(stops());""", [["focus"], 0, ["estop: gamepad"]]),
@@ -292,7 +298,39 @@ SHOWN: Rows = {
 # fmt: on
 
 
-# -- a session that has ended
+# -- the connection to the server, and the end of a session
+
+_SOCKET = """
+let now = 0;
+performance.now = Date.now = () => now;
+globalThis.location = { origin: "http://127.0.0.1" };
+globalThis.setTimeout = () => {};
+const sockets = [], sent = [];
+globalThis.WebSocket = class {
+  static OPEN = 1;
+  readyState = 1;
+  constructor() { sockets.push(this); }
+  send(text) { sent.push(JSON.parse(text).op); }
+  close() {}
+};
+const socket = new ControlSocket({ store: { sync() {} }, version: "1" });
+const welcome = () => sockets.at(-1).onmessage({ data: '{"op": "welcome"}' });
+const after = (ms) => { now += ms; socket.check(); return socket.state; };
+socket.connect();
+"""
+control = Script({"core/control-socket.js": "ControlSocket"}, _SOCKET)
+# fmt: off
+CONTROL: Rows = {
+    "a connection has eight seconds to begin, and is lost without a word for 1.5": (
+        "result = [after(7900)]; welcome(); result.push(after(1400), after(200));", ["connecting", "open", "lost"]),
+    "it is lost since it was there last": ("""
+        now = 1000; socket.lost(0); now = 2000; socket.lost(0); result = [socket.lostAt];
+        socket.connect(); welcome(); now = 3000; socket.lost(0); result.push(socket.lostAt);""", [1000, 3000]),
+    "nothing is sent before its begin and after its end": ("""
+        const send = () => socket.send({ op: "drive" }); result = [send()]; welcome(); result.push(send());
+        sockets[0].readyState = 2; result.push(send(), sent);""", [False, True, False, ["drive"]]),
+}
+# fmt: on
 
 
 @pytest.mark.parametrize(("answer", "reloads"), [("opaqueredirect", 1), ("basic", 0)])
@@ -309,6 +347,6 @@ def test_a_session_that_has_ended_leads_to_the_login_which_leads_back(answer: st
     assert evaluate({"core/control-socket.js": "ControlSocket"}, steps, answer) == reloads
 
 
-@rows((driver, DRIVER), (shown, SHOWN))
+@rows((driver, DRIVER), (shown, SHOWN), (control, CONTROL))
 def test_each(found: Callable[[], Any], expected: Any) -> None:
     assert found() == expected

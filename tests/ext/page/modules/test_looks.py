@@ -18,7 +18,11 @@ from tests.support import ROOT, some
 
 LOOKS = "ui/parts/looks.js"
 looks = Script(
-    {LOOKS: "charge, looksOf"},
+    {
+        LOOKS: "charge, hasFace, looksOf",
+        "ui/parts/more-words.js": "charging, plain",
+        "ui/parts/words.js": "battery, reported, span",
+    },
     "const look = (id, payload) => looksOf(`pebble/robots/${id}`, payload);"
     "const brief = (one) => [one.name, one.picture, typeof one.colour, one.cells];"
     "const percent = (value, unit, cells) => charge({ value, unit }, cells);",
@@ -46,13 +50,29 @@ FACES: Rows = {
     "what is no look is not used": (
         f"result = brief(look('constructor', {stated(colour='url(x)', picture='__proto__', battery_cells=-1)}));",
         ["constructor", "wheeled", "string", 0]),
-    "a long name is cut": (f"result = look('r7', {stated(name='x' * 40)}).name;", "x" * 32 + " (r7)"),
+    "what is long is cut": (
+        f"const one = look('r7', {stated(name='x' * 40, description='y' * 99)}); result = [one.name, one.description];",
+        ["x" * 32 + " (r7)", "y" * 60]),
+    "robots have faces": ("result = ['robots', 'towers'].map((type) => hasFace(`pebble/${type}/a`));", [True, False]),
     "a name steers nothing": (f"result = look('r7', {stated(name=chr(0x202E) + 'x')}).name;", "\\u202ex (r7)"),
     "a battery is in percent where its cells are known": (
         "result = [[8.4, 2], [6, 2], [7.64, 2], [9, 2], [8, 0]].map(([value, cells]) => percent(value, 'V', cells));",
         [100, 0, 50, 100, None]),
     "or where it says percent": (
         "result = [percent(81, '%', 0), percent('x', 'V', 2), charge(undefined, 2)];", [81, None, None]),
+    "or as it says": (
+        "result = [{ value: 7.918, unit: 'v' }, { value: 81, unit: '%' }, 5, null].map((one) => battery(one));",
+        ["7.92 V", "81.0 %", "5.0", "–"]),
+    "how long anything was": (
+        "result = [68, 5200, 18_000, 18 * 60_000, 3 * 3_600_000, 2 * 86_400_000].map(span);",
+        ["68 ms", "5.2 s", "18 s", "18 min", "3 h", "2 days"]),
+    "where its stream is": (
+        "result = [{ value: { webrtcUrl: 'http://a' } }, { url: 5 }, null].map(reported);", ["http://a", "", ""]),
+    "whether it charges is known or not": (
+        "result = [true, false, 'x'].map((value) => charging({ value }));", ["charging", "not charging", ""]),
+    "any value of it is one line": ("""
+        result = [1234.5678, 123_456.7, null, undefined, true, [1, { a: 2 }], { a: { b: "x" }, c: [] }].map(plain);""",
+        ["1234.6", "123457", "–", "–", "true", "[1, a 2]", "a {b x} · c []"]),
 }
 # fmt: on
 
@@ -91,6 +111,9 @@ COLUMNS: Rows = {
     "one column has them one after another": (
         f"result = at(1, [{STATE}, {MAP}, {PLOTS}, END], false);",
         {"state": [0, 0, 1], "map": [68, 0, 1], "plots": [176, 0, 1]}),
+    "what is wide leaves the last column to driving": (
+        f"result = at(3, [STAGE, DRIVE, {STATE}, {PLOTS}, END], true, {{ state: [[0, 1]] }});",
+        {"state": [164, 0, 1], "plots": [164, 1, 1]}),
     "a card keeps its column, and what is below it moves": (
         f"result = at(2, [STAGE, DRIVE, {STATE.replace('68', '200')}, {MAP}, END], true,"
         "{ state: [[0, 1]], map: [[0, 1]] });", {"state": [164, 0, 1], "map": [364, 0, 1]}),
@@ -113,7 +136,8 @@ book = Script({"core/logs.js": "LogBook, MOST"}, _BOOK, "result ??= texts();")
 
 # fmt: off
 BOOK: Rows = {
-    "lines are taken once": ("take(1, 'a', 'b'); take(2, 'b', 'c'); take(1, 'a');", ["a", "b", "c"]),
+    "lines are taken once": (
+        "take(1, 'a', 'b'); take(2, 'b', 'c'); take(1, 'a'); result = [texts(), book.cut];", [["a", "b", "c"], False]),
     "missing numbers are shown": (
         "take(4, 'a'); take(6, 'b'); take(19, 'c');",
         ["a", "… 1 line was dropped", "b", "… 12 lines were dropped", "c"]),
@@ -147,6 +171,7 @@ lacks = Script({"ui/cards/system.js": "lacks"})
 LACKS: list[tuple[str, Any, str]] = [
     ("reboot", None, ""),
     ("reboot", {}, NOT_OFFERED),
+    ("reboot", {"reboot": False}, NOT_OFFERED),
     ("reboot", {"system": {"reboot": {"available": True, "controls": True}}}, ""),
     ("reboot", {"system": {"reboot": {"available": True, "controls": False}}}, NO_COMMAND),
     ("reboot", {"system": {"reboot": {"available": False, "controls": False}}}, NOT_OFFERED),

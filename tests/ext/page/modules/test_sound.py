@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import json
 import random
 from collections.abc import Callable
 from typing import Any
@@ -9,13 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pebble.errors import PayloadError
+from pebble.extensions.media import opus
 from pebble.extensions.media.jitter import JitterBuffer
 from pebble.extensions.media.packets import Codec, Sound
 from pebble.extensions.media.pcm import Resampler
-from pebble.extensions.media.speech import Speech
+from pebble.extensions.media.sound import unpack
 from tests.ext.media.test_jitter import play
 from tests.ext.page.in_node import STATIC, Rows, Script, evaluate, rows
 from tests.support import cases
+from tests.vectors import make_pbat
 
 # -- the microphone and talks: a question of the browser is answered by ``answer()`` or ``answer(error)``
 
@@ -68,11 +73,12 @@ define("Worker", class {
 _SOUND = """
 const REF = "pebble/robots/goob";
 const changes = [];
-const route = { ref: REF, onChange: (fn) => changes.push(fn) };
+const onChange = (fn) => changes.push(fn);
+const route = { ref: REF, onChange };
 const go = (ref) => { route.ref = ref; changes.forEach((fn) => fn()); };
 const shown = [];
 const connection = {
-  isOpen: true, may: () => true, you: { user: "anna" }, show: (text) => shown.push(text), onChange() {},
+  isOpen: true, may: () => true, you: { user: "anna" }, show: (text) => shown.push(text), onChange,
 };
 const store = new Store(undefined, (flush) => flush());
 store.set(REF, "capabilities", { value: { audio: { available: true } } });
@@ -107,6 +113,14 @@ MICROPHONE: Rows = {
 # fmt: on
 
 
+#: What is different, and why no person can talk then.
+WHY_NO_TALK = {
+    "store.set(REF, 'capabilities', { value: {} })": "goob has no sound",
+    "connection.may = () => false": "Log in as driver to talk",
+    "navigator.mediaDevices = undefined": "Needs https",
+    "store.set(REF, 'link', { level: 'narrow' })": "The connection of goob is too slow for a voice",
+    "store.set(REF, 'web/sound', { talker: 'bob' })": "bob is talking",
+}
 # fmt: off
 SOUND: Rows = {
     "a talk uses the microphone which is muted until the next one": ("""
@@ -120,9 +134,15 @@ SOUND: Rows = {
     **{f"a microphone that is granted after the talk is given back: {end}": (
         f"await talk(true); {end}; await answer(); result = [open().length, told.includes('talk 1')];", [0, False])
         for end in ("await talk(false)", "sound.interrupt()", "go('')")},
-    **{f"what interrupts a gesture closes the microphone: {before}": (
-        f"await talk(true); await answer(); {before} sound.interrupt(); result = [open().length, sound.talking];",
-        [0, None]) for before in ("", "await talk(false);")},
+    **{f"what interrupts a gesture closes the microphone, and to let go then begins no talk: {before}": (
+        f"await talk(true); await answer(); {before} sound.interrupt(); await talk(false);"
+        "result = [open().length, sound.talking];", [0, None]) for before in ("", "await talk(false);")},
+    "a talk ends where another person uses the page": ("""
+        await talk(true); await answer(); go(REF); result = [heard()];
+        connection.you = { user: "bob" }; go(REF); result.push(heard(), told.length);""", [1, 0, 3]),
+    "nothing is heard while a person talks": ("""
+        await talk(true); result = [sound.speaker.gain.gain.value]; await talk(false);
+        result.push(sound.speaker.gain.gain.value);""", [0, 1]),
     "why a talk has failed is known until the next one or another component": ("""
         const denied = () => Object.assign(new Error("no"), { name: "NotAllowedError" });
         await talk(true); await answer(denied()); result = [sound.problem, sound.talking];
@@ -134,12 +154,9 @@ SOUND: Rows = {
     "a talk that cannot begin is no talk": (
         "broken = 'worker'; await talk(true); result = [sound.talking, sound.problem, questions.length];",
         [None, "Talking has failed: no worker", 0]),
-    "a key that cannot talk shows why": (
-        "connection.may = () => false; await talk(true); result = [shown, sound.talking];",
-        [["Not done: Log in as driver to talk"], None]),
-    "over a slow connection no microphone is asked for": (
-        "store.set(REF, 'link', { level: 'narrow' }); await talk(true); result = [shown, questions.length];",
-        [["Not done: The connection of goob is too slow for a voice"], 0]),
+    **{f"a key that cannot talk shows why and asks for no microphone: {why}": (
+        f"{change}; await talk(true); result = [shown, sound.talking, questions.length];",
+        [[f"Not done: {why}"], None, 0]) for change, why in WHY_NO_TALK.items()},
     "a talk that a slow connection ends has its reason beside the button": ("""
         await talk(true); await answer(); store.set(REF, "link", { level: "thin" });
         sound.take({ answer: { talk: 1, on: false, why: sound.talkReason() } });
@@ -157,7 +174,9 @@ def test_the_socket_has_the_name_of_the_person_and_a_page_that_stood_still_learn
     const said = [], urls = [];
     define("self", { postMessage: (message) => said.push(message) });
     define("location", { origin: "http://127.0.0.1" });
-    define("WebSocket", class { static OPEN = 1; constructor(url) { urls.push(url); } });
+    let socket;
+    define("WebSocket", class { static OPEN = 1; readyState = 1; sent = []; bufferedAmount = 0;
+      constructor(url) { urls.push(url); socket = this; } send(piece) { this.sent.push(piece); } });
     let now = 0;
     performance.now = () => now;
     await import(given);
@@ -165,11 +184,12 @@ def test_the_socket_has_the_name_of_the_person_and_a_page_that_stood_still_learn
     const port = { close() {} };
     self.onmessage({ data: { op: "talk", talk: 3, rate: 16_000, port } });
     const feed = () => port.onmessage({ data: new Float32Array(1024) });
-    feed(); now = 900; feed(); result = [said.length]; now = 1100; feed();
+    feed(); now = 900; feed(); result = [said.length]; const { length } = socket.sent;
+    socket.bufferedAmount = 10_000; feed(); result.push(length, socket.sent.length); now = 1100; feed();
     result.push(said, Object.fromEntries(new URL(urls[0]).searchParams));"""
     worker = (STATIC / "media" / "sound-worker.js").as_uri()
     assert evaluate({}, steps, worker) == [
-        0, [{"answer": {"talk": 3, "on": False, "why": "The page stood still: talk again"}}],
+        0, 6, 6, [{"answer": {"talk": 3, "on": False, "why": "The page stood still: talk again"}}],
         {"ref": "a/b/c", "can": "", "name": "Ann & Bo", "device": "phone"},
     ]  # fmt: skip
 
@@ -204,11 +224,48 @@ def test_the_lead_at_the_loudspeaker_grows_when_the_worker_is_late_and_shrinks_a
       run(0.1, false);
       run(1);
     }
-    result.push(run(0), run(60));"""
-    assert evaluate({"media/playout.js": "Playout"}, steps) == [20, 40, 20]
+    result.push(run(0), run(60));
+    now += 5000;  // the loudspeaker has stopped, and so does its clock
+    result.push(Math.round(1000 * (playout.now() - playout.played / RATE)));"""
+    assert evaluate({"media/playout.js": "Playout"}, steps) == [20, 40, 20, 100]
 
 
-# -- buffer and resampler do exactly what those of pebble.extensions.media do, on the same packets
+# -- packets, buffer and resampler do exactly what those of pebble.extensions.media do, on the same packets
+
+_UNPACK = """
+result = given.map((hex) => {
+  try {
+    const { rate, channels, frames, sequence } = unpack(new Uint8Array(Buffer.from(hex, "hex")));
+    return [rate, channels, frames, sequence];
+  } catch { return null; }
+});
+"""
+
+
+def unpacked(raw: bytes) -> list[int] | None:
+    """What pebble.extensions.media.sound finds in a packet; None: it cannot be played."""
+    try:
+        one = unpack(raw)
+    except PayloadError:
+        return None
+    return [one.rate, one.channels, one.samples, one.sequence]
+
+
+def test_the_same_packets_can_be_played() -> None:
+    """Packets of every kind, and short ones with any byte of their beginning changed."""
+    bodies = [[bytes([first, 2, 0])] * count for first in range(256) for count in (1, 3, 4)]
+    lasting = [(opus.join(body), 48 * sum(map(opus.milliseconds, body))) for body in bodies]
+    packets = [Sound(Codec.OPUS, 1, 48000, int(samples), 1, 1, body).pack() for body, samples in lasting]
+    packets += [Sound(Codec.OPUS, 2, 16000, 320, 7, 1, b"\1\1" + bytes([8] * 257)).pack()]
+    for channels, rate, samples in itertools.product((8, 9), (3999, 4000), (1, 4000, 4001)):
+        packets += [Sound(Codec.PCM16LE, channels, rate, samples, 1, 1, bytes(2 * channels * samples)).pack()]
+    vectors = [bytes.fromhex(one["hex"]) for one in json.loads(make_pbat.FILE.read_text())]
+    packets += vectors
+    for packet in [packet for packet in packets[::100] + vectors if len(packet) < 50]:
+        packets += [packet[:at] + bytes([to]) + packet[at + 1 :] for at in range(30) for to in (0, 1, 2, 3, 9, 255)]
+    found = evaluate({"media/sound-packet.js": "unpack"}, _UNPACK, [packet.hex() for packet in packets])
+    assert found == list(map(unpacked, packets))
+
 
 EPOCH_MS = 1_700_000_000_000
 Arrival = tuple[float, bytes]
@@ -302,10 +359,10 @@ def test_the_jitter_buffer_plays_the_same_samples_at_the_same_times(seeds: range
     assert evaluate(modules, _PLAY, given) == expected
 
 
-@pytest.mark.parametrize(("rate", "rate_out"), [(16000, 44100), (48000, 16000)])
+@pytest.mark.parametrize(("rate", "rate_out"), [(16000, 44100), (48000, 16000), (11025, 48000)])
 def test_the_resampler_makes_the_same_samples(rate: int, rate_out: int) -> None:
-    speech = Speech(rate).samples(0, rate // 2)
-    pieces = np.array_split(speech, 23)
+    sound = np.random.default_rng(7).integers(-8192, 8192, (rate // 2, 1))
+    pieces = np.array_split(sound, 23)
     resampler = Resampler(rate, rate_out, 1)
     expected = np.concatenate([resampler.feed(piece) for piece in pieces])[:, 0]
     steps = f"""

@@ -328,15 +328,24 @@ def test_a_person_may_end_the_script_where_the_config_wants_it(tmp_path: Path) -
         assert walk.signals == [TERM]
 
 
-def test_a_start_right_after_a_persons_final_zero_is_refused_instead_of_ended_two_seconds_later(bench: Bench) -> None:
-    bench.drive(z=0.0, valid_ms=0)
+@pytest.mark.parametrize(
+    ("drive", "file", "why"),
+    [
+        ({"z": 0.0, "valid_ms": 0}, "walk", f"{OVERRIDDEN} just now: start it again in 2 s"),
+        ({"z": 0.5}, "old", "a person drives: start it again after 2 s without a command"),
+    ],
+)
+def test_a_start_right_after_a_persons_last_command_is_refused_instead_of_ended_two_seconds_later(
+    bench: Bench, drive: dict[str, float], file: str, why: str
+) -> None:
+    bench.drive(**drive)
     bench.quiet()
-    bench.command({"action": "start", "file": "walk"})
-    assert bench.becomes(error=f"Failed to start walk: {OVERRIDDEN} just now: start it again in 2 s", running=False)
+    bench.command({"action": "start", "file": file})
+    assert bench.becomes(error=f"Failed to start {file}: {why}", running=False)
     bench.advance(2.01)
     bench.drive(z=0.0)  # a release
     bench.quiet()
-    bench.start("walk")
+    bench.start(file)
 
 
 def test_where_names_are_checked_only_who_has_control_starts_a_script(tmp_path: Path) -> None:

@@ -183,7 +183,7 @@ def _trials(settings: Settings, robots: Sequence[ImpairedRobot], progress: Progr
     by_form = grouped(robots, lambda robot: robot.subject.partition(" ")[2])
     with ThreadPoolExecutor(len(robots), thread_name_prefix="subject") as pool:
         try:
-            list(pool.map(ImpairedRobot.report, robots))  # the first one: the robot is ready
+            list(pool.map(ImpairedRobot.report, robots))  # an operator's first report: its robot is ready
             for number, condition in enumerate(trial for trial in CONDITIONS if trial.name in settings.trials):
                 for of_form in in_turn(list(by_form.values()), number):
                     progress(f"{condition.name}: {', '.join(robot.subject for robot in of_form)}")

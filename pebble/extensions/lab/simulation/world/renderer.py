@@ -107,12 +107,13 @@ class Renderer:
         slope = (self._width / 2 + _BESIDE_PX) / self._focal
         share_from, share_to = np.zeros(len(plan)), np.ones(len(plan))
         # The near plane, then the right and the left edge of the view. Each cuts a surface to the share (0 to 1 of its
-        # length) that is visible. A distance is that of an end, positive on the visible side.
+        # length) that is visible. The distances are those of the surface's two ends, positive on the visible side.
         for distance1, distance2 in (
             (ahead1 - _NEAR_M, ahead2 - _NEAR_M),
             (slope * ahead1 - right1, slope * ahead2 - right2),
             (slope * ahead1 + right1, slope * ahead2 + right2),
         ):
+            # the share at which a surface with its ends on two sides crosses; 0 (unused) if it is parallel
             crossing = distance1 / np.where(distance1 == distance2, np.inf, distance1 - distance2)
             # A surface that is outside as a whole enters at its end, and leaves at its start: nothing is between.
             enters = np.where(distance1 < 0, np.where(distance2 > 0, crossing, 1.0), 0.0)
@@ -157,8 +158,9 @@ class Renderer:
         area = (columns[1] - columns[0]) * (rows[:, 1] - rows[:, 0]).mean()
         whole_width = math.dist(surface.left, surface.right)
         area *= whole_width / max(1e-9, math.dist(plan[0], plan[1]))  # of the whole surface, also beside the picture
-        fine = [level for level, texture in enumerate(surface.textures) if len(texture) ** 2 >= area]
-        level = fine[-1] if fine else 0  # the smallest that is not enlarged
+        pixels = [len(texture) ** 2 for texture in surface.textures]  # falling
+        large_enough = [level for level, count in enumerate(pixels) if count >= area]
+        level = large_enough[-1] if large_enough else 0  # the smallest that is not enlarged
         size = len(surface.textures[level])
         (ahead1, right1), (ahead2, right2) = self._to_camera(np.array((surface.left, surface.right)), me)
         to_space = np.array(  # from pixels of the texture to (right, down, ahead) of the camera
@@ -234,9 +236,9 @@ def _covers(plan: _Floats, layers: NDArray[np.int_], columns: _Floats) -> NDArra
     normal *= np.where((start * normal).sum(axis=1, keepdims=True) > 0, -1.0, 1.0)  # towards the camera
     # how far each edge of i is in front of the plane of j, negative behind it: [i, edge, j]
     before = np.einsum("iek,jk->iej", plan, normal) - (start * normal).sum(axis=1)
-    most, least = before.max(axis=1), before.min(axis=1)  # of the two edges
-    in_front = (least > -_TOUCHING_M) & (most > _TOUCHING_M)  # of i both edges, one of which may touch the plane of j
-    behind = (most < _TOUCHING_M) & (least < -_TOUCHING_M)  # the same on the other side
+    most, least = before.max(axis=1), before.min(axis=1)  # of the two edges of i: [i, j], as all that follow
+    in_front = (least > -_TOUCHING_M) & (most > _TOUCHING_M)  # i is in front of the plane of j; an edge may touch it
+    behind = (most < _TOUCHING_M) & (least < -_TOUCHING_M)  # i is behind the plane of j; an edge may touch it
     one_plane = (np.abs(before) <= _TOUCHING_M).all(axis=1)
     may_cover = in_front | behind.T  # i is in front of the plane of j, or j is behind the plane of i
     # If each may cover the other, neither does.

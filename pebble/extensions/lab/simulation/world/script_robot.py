@@ -108,8 +108,8 @@ class SimulatedRobot(Robot):
         """Receive a message of another program. A drive command without a source is a person's."""
         self._messages[channel] = (value, self.world.now())
         if channel == DRIVE:
-            self._sender.receive(value, self.world.now())
-            self._drive(value)
+            self._sender.receive(value, self.world.now())  # so that the script's own commands give way
+            self._drive(value)  # the motor owner's part: here it obeys every sender
         for wanted, handler in self._handlers:
             if wanted == channel:
                 handler(value)

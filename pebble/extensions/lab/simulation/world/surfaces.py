@@ -48,7 +48,7 @@ class Surfaces:
         self._textures: dict[int, tuple[Image, ...]] = {}
         room_walls = world.room.walls if world.room else ()
         self._fixed = [
-            *(_left_side(wall, index) for index, wall in enumerate(room_walls)),  # which faces into the room
+            *(_left_side(wall, index) for index, wall in enumerate(room_walls)),  # the side that faces into the room
             *chain(*(_both_sides(wall, index) for index, wall in enumerate(world.walls))),
             *map(_drawn, world.drawings),
             *(self._tag(tag.id, tag.size_m, tag.x, tag.y, tag.z, math.radians(tag.yaw_deg)) for tag in world.tags),

@@ -187,7 +187,7 @@ class ViewerQueue:
 
     def rescue(self, now: float) -> None:
         """Move the page to the rescue stream: for a while if it is slow, otherwise until the next key frame."""
-        if self.overflowed or self.is_thin:  # slow; if not, the time of an earlier rescue is over
+        if self.overflowed or self.is_thin:  # slow; else ``_retry_at`` stays in the past: any key frame ends the rescue
             self._retry_at = now + _RETRY_S
         self.rescued = True
         self.wait_for_keyframe()
@@ -217,9 +217,9 @@ def assess(viewers: Collection[ViewerQueue], encoding: str, now: float, *, can_r
     patience_s = 0.0 if encoding == "h264" else _JPEG_PATIENCE_S
     waiting = [viewer for viewer in direct if viewer.waiting and viewer.waiting_s(now) >= patience_s]
     most_wait = bool(direct) and 2 * len(waiting) >= len(direct)
-    if most_wait or encoding != "h264":
+    if most_wait or encoding != "h264":  # JPEG: a few viewers wait for the next one
         return most_wait
     for viewer in waiting:
         if can_rescue and (viewer.overflowed or viewer.waiting_s(now) > _RESCUE_AFTER_S):
             viewer.rescue(now)
-    return any(viewer.unserved for viewer in waiting)
+    return any(viewer.unserved for viewer in waiting)  # new ones, for which none was requested yet

@@ -85,7 +85,7 @@ class ViewerRequest:
         """
         if message.payload in self.sent:
             self.sent.remove(message.payload)
-        elif not message.retain:
+        elif not message.retain:  # a retained command is stale
             with suppress(PayloadError):
                 request = codec.decode(self._control, message.payload)
                 if not request.keyframe:

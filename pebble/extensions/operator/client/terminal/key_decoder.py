@@ -46,7 +46,7 @@ class KeyDecoder:
             at = key.end()
         incomplete = data[at:]
         if incomplete != self._waiting:
-            is_too_long = len(incomplete) > _LONGEST  # its first two bytes tell how it ends
+            is_too_long = len(incomplete) > _LONGEST  # its first two bytes suffice to find its end
             self._waiting = incomplete[:2] if is_too_long else incomplete
             self._since = now
         return keys
