@@ -8,12 +8,10 @@ from pebble.transports.mqtt.bridge_mode import Result
 #: What to do if a broker hangs up on a CONNECT without TLS, and if it hangs up on TLS.
 WANTS_TLS: Final = "if this port is for TLS: mqtts://, or tls.enabled in a config"
 _NO_TLS: Final = "use mqtt://, or the port for TLS (8883)"
+_OTHER_NAME: Final = "name the host as it does"
+_EXPIRED: Final = "renew it"
+_UNKNOWN: Final = "name its authority: --ca-cert FILE, tls.ca_cert"
 #: How to mend a certificate that is refused, by OpenSSL's number of the reason; by default its authority is not known.
-_OTHER_NAME, _EXPIRED, _UNKNOWN = (
-    "name the host as it does",
-    "renew it",
-    "name its authority: --ca-cert FILE, tls.ca_cert",
-)
 _CERTIFICATE: Final = {10: _EXPIRED, 62: _OTHER_NAME, 64: _OTHER_NAME}
 TLS_FIXES: Final = (WANTS_TLS, _NO_TLS, _OTHER_NAME, _EXPIRED, _UNKNOWN)
 
