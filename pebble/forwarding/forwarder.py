@@ -209,7 +209,7 @@ class Forwarder:
     def _receive_named(self, source: SideState, names: Names, message: Message) -> Routed:
         """Forward a message whose sender is checked: the name moves from the topic into the payload."""
         sender = names[message.topic]
-        subject, by = sender.subject, sender.account  # by: a Signed, below, adds the person for whom the account acts
+        subject, by = sender.subject, sender.account  # by: later as in Signed, with the person behind the account
         outcome = self.admit(source, subject, message, sender.topic, by != NO_ACCOUNT)  # notes foreign retained ones
         if subject is None:
             outcome = sender.foreign  # why the topic means nothing to this robot
@@ -219,7 +219,7 @@ class Forwarder:
                     outcome = self.retained.change(subject, signed)  # the topic without a name gets it on both sides
                 case Signed(signed, by):
                     outcome = self.pass_on(source, subject, signed, outcome, sender.account)
-                case Drop.UNNAMED if outcome.retain:  # perhaps the robot's own, as the remote broker has retained it
+                case Drop.UNNAMED if outcome.retain:  # retained: perhaps the robot's own, as the remote broker has it
                     outcome = self.retained.receive(source, subject, message, outcome, only_old=True)
                 case Drop() as drop:
                     outcome = drop
@@ -333,7 +333,7 @@ class Forwarder:
     def _without_script(self, source: SideState, message: Message) -> Message | None:
         """Return a drive command without a script's signature; None if a script's command would move the robot."""
         passing = unsigned(message.payload)
-        if passing is message.payload:
+        if passing is message.payload:  # it has no signature
             return message
         self._quiet_log.warning(Drop.SIGNED.name, "%s: %s", message.topic[:_LOGGED], Drop.SIGNED.value)
         if passing is None:
@@ -378,7 +378,7 @@ class Forwarder:
         if self.gate is Gate.SHUT:
             return Drop.CLOSED
         target.events.hold(message)
-        gate = self.sides.gate  # again: who opened or shut it meanwhile may have found the events without this one
+        gate = self.sides.gate  # read again: it may have been opened or shut just before this event was held
         if gate is Gate.OPEN:
             target.events.resume()
         elif gate is Gate.SHUT:

@@ -137,7 +137,7 @@ class ForwardingService(Service, ABC):
         self.unsubscribe(Side.REMOTE)
         self.forwarder.sides[Side.REMOTE].subscribing()
         receive = partial(self.receive_remote, self.epoch)
-        directions = (INCOMING,) if self.rules.leaves_robot else (INCOMING, OUTGOING)  # OUTGOING is only the robot's
+        directions = (INCOMING,) if self.rules.leaves_robot else (INCOMING, OUTGOING)  # outside only we send OUTGOING
         self.subscriptions[Side.REMOTE] = [
             self.remote.subscribe(filter_, receive, echo=False, direct=True)
             for filter_ in self.subjects.filters(*directions)

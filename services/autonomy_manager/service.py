@@ -95,6 +95,7 @@ class AutonomyManager(Service):
 
     @on(AUTONOMY_COMMAND)
     def command(self, command: AutonomyCommand) -> None:
+        """Start a script, or stop the one that runs; ``enabled`` decides only where ``action`` is no known word."""
         word = (command.action or "").strip().lower()
         is_known = word in (*_START, *STOP_WORDS)
         begin = word in _START if is_known else command.enabled

@@ -359,7 +359,7 @@ class MqttBridge(ForwardingService):
         keys = None  # without a valid state: the stamp of every command is judged
         with suppress(PayloadError):
             state: ControlState = codec.decode(c.CONTROL_STATE, payload)
-            keys = frozenset([state.key.encode()]) - {b""}  # none if no client has control: no stamp is judged
+            keys = frozenset([state.key.encode()]) - {b""}  # key "": no client has control, so no stamp is judged
             self._observers.tell(Observer.control, state)
         self.forwarder.ages.keys = keys
 

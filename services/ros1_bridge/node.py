@@ -319,6 +319,7 @@ class Node:
         self._in_sockets(close)
 
     def _run_sockets(self) -> None:
+        """Serve the sockets until the node ends; close connections that have said nothing for GREETING_S."""
         while not self._ends.is_set():
             for key, _ in self._select.select(0.25 if self._greetings else 1.0):
                 self._attempt(key.data)

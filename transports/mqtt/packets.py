@@ -390,7 +390,7 @@ def properties(data: bytes) -> dict[int, int]:
             values[number] = int.from_bytes(data[at : at + size], "big")
             at += size
         elif number in _TEXTS:
-            for _ in range(_TEXTS[number]):
+            for _ in range(_TEXTS[number]):  # skips as many texts, each of which begins with its length
                 at += 2 + int.from_bytes(data[at : at + 2], "big")
         else:
             _, at = _read_variable(data, at)  # a subscription identifier, or one that no version has yet

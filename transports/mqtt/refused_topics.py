@@ -99,7 +99,7 @@ class RefusedTopics:
             suspects = {topic: size for topic, size in often.items() if not self._is_vital(topic)}
         if len(suspects) == 1:
             self._blame(where, *suspects.popitem(), now)
-        elif suspects:  # one of these: vital ones are withheld if large, others at any size (0), until a trial
+        elif suspects:  # one of several: each is withheld, a vital one only if LARGE, until its trial
             for topic in suspects:
                 if len(self.withheld) < TOPICS:
                     self.withheld[topic] = Withheld(LARGE if self._is_vital(topic) else 0, now)

@@ -131,7 +131,7 @@ class Control:
         if "drive" in self._rights():
             server.drivers.restore(hello.token, self._tab)
         server.robots.join(self._interest)
-        self._interest.dirty |= {(ref, "web/driver") for ref in server.robots.components}  # not by `join`: see _flush
+        self._interest.dirty |= {(ref, "web/driver") for ref in server.robots.components}  # `join` leaves these out
         self._post(self._ping())
 
     def _end(self) -> None:

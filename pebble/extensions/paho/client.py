@@ -152,7 +152,7 @@ class PahoClient:
             self.close()
         # With TLS the number of unpacked bytes does not tell whether the socket has more.
         self.drained = not data or (len(data) < _PIECE and self._context is None)
-        self._paho.ahead, self._paho.begin = data, 0
+        self._paho.ahead, self._paho.begin = data, 0  # paho reads these bytes, from the first one on
         return len(data)
 
     owes = False  # paho acknowledges as it reads

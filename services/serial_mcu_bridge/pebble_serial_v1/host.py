@@ -244,7 +244,7 @@ class Session:
         if len(self.known) > _REMEMBERED:
             self.known.popitem(last=False)
         if manifest == self.manifest:
-            self._ask_at = None  # nothing has changed, so the doubt is over
+            self._ask_at = None  # the present manifest is right: no further request
             return
         yield from self._forget("its manifest differs")
         yield from self._begin(Described(manifest))

@@ -278,9 +278,9 @@ def last_will(trial: BrokerTrial) -> CheckResult:
     if seconds > _WILL_S + trial.round_trip_s:
         trial.late = True  # as above
         return warn(f"one is published {seconds:.1f} s after the connection is reset")
-    late = trial.peer()
-    late.subscribe("online", qos=trial.qos)
-    trial.wait(lambda: not retain or late.received)
-    if retain and late.payloads()[-1:] != [b"gone"]:
+    latecomer = trial.peer()
+    latecomer.subscribe("online", qos=trial.qos)
+    trial.wait(lambda: not retain or latecomer.received)
+    if retain and latecomer.payloads()[-1:] != [b"gone"]:
         return warn("one is published, and not retained", "allow retained wills")
     return ok(f"once, {seconds:.2f} s after a reset{', and retained' if retain else ''}")

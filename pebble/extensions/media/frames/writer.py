@@ -236,6 +236,7 @@ class FrameWriter:
         return chunk
 
     def _put(self, payload: Any, info: FrameInfo, *, shared: bool = False) -> bool:
+        """Send a frame; False if this is closed. ``shared``: it is in shared memory, and ``payload`` refers to it."""
         publishers = self._publishers
         if publishers is None:
             return False
@@ -252,7 +253,7 @@ class FrameWriter:
         self.counters.add("written")
         if shared:
             self.counters.add("shared")
-        elif self._pool is not None:
+        elif self._pool is not None:  # which had no room
             self.counters.add("fallbacks")
         return True
 

@@ -139,9 +139,9 @@ class HostTcp(BoardSocket, Stream):
         self._sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self._sock.setblocking(False)
         self._poll = select.poll()
-        self._poll.register(self._sock, 0)
+        self._poll.register(self._sock, 0)  # `ready` sets the events
         self._established = False
-        network.new_sockets.append(self._sock)
+        network.new_sockets.append(self._sock)  # which the program that runs the board watches
 
     def close(self) -> None:
         super().close()
