@@ -107,7 +107,7 @@ class Subscription:
         with self._lock:
             if self._closed:
                 return
-            if not transport.as_published:
+            if not transport.as_published:  # then the flag marks old messages
                 repeat = message.retain and not transport.policy.delivers_late
             if not self._delivered_topics.has(message.topic):
                 self._delivered_topics[message.topic] = None

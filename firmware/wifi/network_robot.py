@@ -57,7 +57,7 @@ class NetworkRobot:
         if hasattr(body, "groups"):
             topics += (b"group",)
         plain = len(topics)  # how many of them, from the first on, are subscribed to without an account
-        if names:  # clients without one may stop, and send zeros; those that may drive may also have control
+        if names:  # without an account: stops and zeros; control, too, if strangers may drive
             plain = _DRIVE + 1 if strangers == 2 else _CONTROL + 1  # 2: strangers may not drive
         self.session = Session(settings, root, topics, plain, names, wrap, self._take)
         self.stops = EmergencyStop(now, _DRIVE_LIMIT_MS, strangers, names)

@@ -72,7 +72,7 @@ class Mirroring:
 
     def is_possible(self) -> bool:
         """True if no side sends our own messages back. Otherwise commands would be repeated, even after a stop."""
-        if all(state.transport.exact_echo for state in self._sides.values()):  # then echo=False is kept to
+        if all(state.transport.exact_echo for state in self._sides.values()):  # subscribe(echo=False) is exact
             return True
         if not self._was_refused:  # it is logged once
             self._was_refused = True

@@ -101,7 +101,7 @@ class Reconciliation:
         # Topics on which nothing of the winner has arrived since its connection began:
         self._offered: set[str] = set()  # those that the winner seemed to lack: it was sent the loser's values
         self._newer: set[str] = set()  # changed by the loser after the winner's retained messages counted as received
-        self._synchronized = dict.fromkeys(Side, False)
+        self._synchronized = dict.fromkeys(Side, False)  # its retained messages count as received
         self._overtaken: set[str] = set()  # changed by the loser while the winner was away
 
     def has_synchronized(self, *sides: Side) -> bool:

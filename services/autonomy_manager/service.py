@@ -273,6 +273,7 @@ class AutonomyManager(Service):
             self.publish(AUTONOMY_STATUS, replace(status, timestamp=time.time()))
 
     def _present_status(self) -> AutonomyStatus:
+        """Return the status. The fields that ``replace`` sets are left out of the message where they do not apply."""
         run = self._runner.run
         main = None if run is None else run.running
         parts = [] if run is None else run.dependencies

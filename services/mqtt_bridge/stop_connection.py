@@ -194,7 +194,7 @@ class StopConnection:
         if state is State.CONNECTED:
             self._connected_at = self._clock()
             return
-        doubtful = self._copies.lost()  # dropped as copies, though perhaps only the main connection had them
+        doubtful = self._copies.lost()  # came over the main connection, dropped as copies, perhaps wrongly
         if state is State.CONNECTING:  # it was lost; if it is CLOSED, we have ended it
             for message in doubtful:
                 self._pass_on(message)

@@ -233,7 +233,7 @@ class MqttTransport(Transport):
         try:
             if self.settings.as_published:
                 is_granted = connection.incoming.as_published
-                if self.as_published and not is_granted:
+                if self.as_published and not is_granted:  # logged once, until it is granted again
                     log.warning("%s has no bridge mode: own messages come back on this connection", connection.where)
                 self.as_published = self.exact_echo = is_granted  # if not, own messages come back: no exact echo
             self._serve(connection, run)

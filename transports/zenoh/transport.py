@@ -49,7 +49,7 @@ class ZenohTransport(Transport):
         self._elsewhere = bool(settings.client and settings.connect)  # its hub and siblings are on other machines
         self._connecting = threading.RLock()  # held while subscribing, and while a connection is made
         self._subscribers: dict[Subscription, zenoh.Subscriber[None]] = {}
-        self._publishers = Publishers(lambda topic: self.policy.is_invented(topic))  # set later, see TopicPolicy
+        self._publishers = Publishers(lambda topic: self.policy.is_invented(topic))  # its owner sets policy later
         self._hub = HubConnection(client_id, will, self._own, self.count_received, settings.account)
         self._reset()
 
@@ -221,7 +221,7 @@ class ZenohTransport(Transport):
             return False
         self._refresh()
         self._set_state(State.CONNECTED)
-        self._send_lacking(session, set())  # only what became pending meanwhile: the hub lacks nothing else
+        self._send_lacking(session, set())  # set(): only what became pending since _send_hello has sent the rest
         return True
 
     def _send_hello(self, session: zenoh.Session) -> bool:
@@ -311,8 +311,8 @@ class ZenohTransport(Transport):
         if subscription in self._subscribers:
             return
         origin = zenoh.Locality.ANY if subscription.echo else zenoh.Locality.REMOTE
-        only_topic = None if is_pattern(subscription.filter) else subscription.filter
-        may_be_ours = subscription.direct and subscription.echo
+        only_topic = None if is_pattern(subscription.filter) else subscription.filter  # None: it matches many
+        may_be_ours = subscription.direct and subscription.echo  # then the handler must not run inside our put()
         late_s, publishers = self._ages.late_s, self._publishers
 
         def take(sample: zenoh.Sample) -> None:
@@ -326,7 +326,7 @@ class ZenohTransport(Transport):
             topic, payload = only_topic or key_to_topic(str(sample.key_expr)), sample.payload.to_bytes()
             qos = min(stamp.qos, subscription.qos)
             message = Message(topic, payload, qos, False, stamp.retain_requested, read_at if since is None else since)
-            if may_be_ours and publishers.thread == threading.get_ident():  # inside put(), see LoopbackQueue
+            if may_be_ours and publishers.thread == threading.get_ident():  # see LoopbackQueue
                 self._loopback.put(subscription, message)
             else:
                 subscription.offer(message)

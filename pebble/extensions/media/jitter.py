@@ -290,7 +290,7 @@ def _faded_in(samples: Samples, rate: int) -> Samples:
 def _faded_over(old: ReceivedSound, new: ReceivedSound) -> ReceivedSound:
     """Return ``new``, with its beginning faded over from ``old``."""
     size = min(len(old.samples), len(new.samples), round(_FADE_S * new.rate))
-    if (old.rate, old.channels) != (new.rate, new.channels) or old is new:  # the same: nothing was skipped
+    if (old.rate, old.channels) != (new.rate, new.channels) or old is new:  # old is new: nothing was skipped
         return new
     weight = np.linspace(0.0, 1.0, size)[:, None]
     samples = new.samples.copy()

@@ -213,7 +213,7 @@ class Control:
         """Publish a command to a robot, once. It is not repeated; the robot's states show its effect."""
         if not self._may(robot_commands.right(op), op):
             return
-        why_not = self._why_not if robot_commands.moves(op) else ""
+        why_not = self._why_not if robot_commands.moves(op) else ""  # which forbids driving alone
         if why := why_not or self._server.drivers.refusals.of_op(op):
             self._refuse(op, why)
             return

@@ -79,7 +79,7 @@ def _read_summary(info: FileInfo, file: RecordingFile, statistics: Any) -> None:
 def _read_all(info: FileInfo, file: RecordingFile, since_ns: int, until_ns: int) -> None:
     """Add the file's messages of this period to ``info``, which must have none."""
     for message in file.read(since_ns=since_ns, until_ns=until_ns):
-        if since_ns <= message.log_ns < until_ns:
+        if since_ns <= message.log_ns < until_ns:  # `read` leaves out only whole chunks
             if not info.messages:
                 info.first_ns = message.log_ns
             info.last_ns = message.log_ns

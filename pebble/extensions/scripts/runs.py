@@ -60,7 +60,10 @@ class LocalScripts:
 
     @contextmanager
     def none_runs(self) -> Iterator[bool]:
-        """Yield True if no script runs, and prevent one during the block; False if one runs, or that is unknown."""
+        """Yield True if no script runs, and prevent one during the block; False if one runs, or that is unknown.
+
+        If it yields False, no script of a neighbour, which is another robot, may drive this one.
+        """
         try:
             file = self._open()
         except OSError as error:

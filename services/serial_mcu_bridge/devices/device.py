@@ -85,7 +85,7 @@ class Device:
 
         A motion sample is stored as well, because summaries repeat the newest one.
         """
-        has_imu_body = route.alias is not None and route.alias.body != ""  # else the alias carries the generic payload
+        has_imu_body = route.alias is not None and route.alias.body != ""  # "": the generic payload
         if route.interface.profile == imu.MOTION and imu.fits(imu.MOTION, sample.value):
             motion = self._reports.motion(sample.t, sample.seq, sample.mcu_ms, sample.value)
             return motion if has_imu_body else sample

@@ -82,7 +82,7 @@ class RobotStop:
         """Return how far the robot's stop has got; SPARED only if the stop is for all robots, not for named ones."""
         if self.confirmed_s is not None:
             return Progress.CONFIRMED
-        # SPARED: by its capabilities it has no motors, neither that a stop holds nor that it drives.
+        # SPARED: in a stop of all robots (not ``named``) one that, by its capabilities, neither obeys stops nor drives.
         if self.estop.has_capabilities and not (self.estop.available or self.estop.drives or self._order.named):
             return Progress.SPARED
         if self.estop.old:

@@ -230,6 +230,7 @@ class RecordingFile:
 
     def _take_over(self, summary: Summary) -> bool:
         """Use the summary; False if it does not cover all messages, as in files of other programs."""
+        # A chunk without an index of messages is left out: it has none, or the count below is not the file's.
         chunks = [_chunk_of(index) for index in summary.chunk_indexes if index.message_index_offsets]
         counted = summary.statistics
         if counted is None or counted.message_count != sum(chunk.messages for chunk in chunks):

@@ -24,7 +24,7 @@ class GyroHeading:
         self._mcu_ms: int | None = None  # of the newest sample, by the board's clock
         self._at = float("-inf")  # when it came
         self._limited = False  # a turn since the last call of :meth:`take` was too fast for the sensor
-        # Sums since the sensor was last judged: of its turns, + in the direction of the wheels, and of theirs, all +.
+        # Sums since the sensor was last judged: its turns, + the way the wheels turn; the wheels' turns, always +.
         self._agreed_rad = self._compared_rad = 0.0
         self._trusted = True
 
