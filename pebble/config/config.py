@@ -319,7 +319,7 @@ def resolved(config: Config) -> dict[str, Any]:
 
     Keys that are not set and have no default are left out; secrets and the values of variables read ``***``.
     """
-    not_in_file = {*Config.__struct_fields__} - {*Root.__struct_fields__}
+    not_in_file = {*Config.__struct_fields__} - {*Root.__struct_fields__}  # extensions' keys are in neither, and stay
     names = [name for name in config.__struct_fields__ if name not in not_in_file and name != "schema_"]
     keys = {name: masked(getattr(config, name), name) for name in names}
     return keys | {
