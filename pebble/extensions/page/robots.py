@@ -334,14 +334,14 @@ class Robots:
     def _interpret(self, component: Component, metric: str, channel: c.Channel, message: Message, now: float) -> None:
         """Update the view of the robot from a message that arrived at ``now``."""
         robot, capabilities_before = component.robot, component.robot.capabilities
-        received_at = time.time() - (time.monotonic() - now)
-        robot.receive(channel, message, now, received_at)
+        wall = time.time() - (time.monotonic() - now)  # the epoch time at ``now``, which is monotonic
+        robot.receive(channel, message, now, wall)
         if channel is c.MCU_DESCRIBE and message.payload:
             component.aliases[metric] = _aliases(message.payload)
         if robot.capabilities is not capabilities_before and "announced" in robot.capabilities:
             self.show_announced(component, now)
         if robot.liveness.reported_offline and component.sent_online is not False:
-            self._refresh(component, now)  # it may be back before the next round
+            self._refresh(component, now)  # at once: it may be back before the next `refresh`
 
     def show_announced(self, component: Component, now: float) -> None:
         """Send pages the capabilities that a component announces, or is assumed to have, until it publishes its own."""
