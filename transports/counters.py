@@ -10,7 +10,7 @@ Every transport counts ``sent``, ``refused`` (not accepted), ``parked`` (retaine
 
 import threading
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 
 #: Messages that were dropped: there was no room, they were too large, or the broker hangs up on their topic.
@@ -39,6 +39,11 @@ class Counters:
     def snapshot(self) -> dict[str, int]:
         with self._lock:
             return {name: count for name, count in self._counts.items() if count}
+
+
+def in_words(counts: Mapping[str, int]) -> str:
+    """Return ``sent 3, dropped 1``; ``none`` if there are none."""
+    return ", ".join(f"{name} {count}" for name, count in counts.items()) or "none"
 
 
 def bounds_reached(*several: Counters) -> dict[str, int]:

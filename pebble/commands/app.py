@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
+from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple
 
 import typer
@@ -157,6 +158,10 @@ def _run(arguments: list[str]) -> int:
         from pebble.config.secret_text import without_secrets  # of use to errors only
 
         wrong = without_secrets(message).replace("float range", "number").replace("int range", "whole number")
+        file = message.rpartition("(")[2].rstrip(")")  # of an argument too many
+        options = () if context is None else context.command.params
+        if file.endswith(".json") and Path(file).is_file() and any("-c" in option.opts for option in options):
+            wrong += f": use -c {file}"
         sys.stderr.write(f"pebble: {wrong}; see {context.command_path if context else 'pebble'} --help\n")
         return 2
     except ModuleNotFoundError as error:

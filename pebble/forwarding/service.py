@@ -18,6 +18,7 @@ from pebble.forwarding.side import Gate
 from pebble.forwarding.subjects import Subject, Subjects
 from pebble.runtime.service import Service, every
 from pebble.transports import Message, State, Subscription, Transport
+from pebble.transports.counters import in_words
 
 CHECK_AGAIN_S = 30.0  # while nothing is forwarded
 CHECK_SOON_S = 1.0  # after the first sign that two sides are one: it may have been a copy
@@ -118,7 +119,7 @@ class ForwardingService(Service, ABC):
         return self.forwarder.dropped()
 
     def stop(self) -> None:
-        self.log.info("forwarded and dropped: %s", self.forwarder.counters.snapshot())
+        self.log.info("messages: %s", in_words(self.forwarder.counters.snapshot()))
 
     # -- the service's thread
 

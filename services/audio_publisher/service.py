@@ -15,6 +15,7 @@ from pebble.runtime.parent import requested_encoding
 from pebble.runtime.service import Service, every, on
 from pebble.services.audio_publisher.rate_control import RateController, Step
 from pebble.transports import QoS, State
+from pebble.transports.counters import in_words
 
 _DEPTH = 10  # chunks of 20 ms that may wait for the sender: the rest of what may be late
 _QUIET_S = 2.0  # without sound from the microphone before that is reported
@@ -52,7 +53,7 @@ class AudioPublisher(Service):
         self._thread = threading.Thread(target=self._read, name="pebble-microphone", daemon=True)
 
     def start(self) -> None:
-        self.on_stop(lambda: self.log.info("sound: %s", self.counters.snapshot()))
+        self.on_stop(lambda: self.log.info("sound: %s", in_words(self.counters.snapshot())))
         self._remote.open(timeout=0.0)
         self.on_stop(self._remote.close)
         self._reader.open()

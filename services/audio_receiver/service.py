@@ -16,6 +16,7 @@ from pebble.runtime.connections import remote_transport
 from pebble.runtime.service import Service, every
 from pebble.services.audio_receiver.player import Player
 from pebble.transports import Message, QoS, State
+from pebble.transports.counters import in_words
 
 _IDLE_S = 0.5  # between two checks whether it has been silent for long
 _END_S = 1.5
@@ -43,7 +44,7 @@ class AudioReceiver(Service):
         self._remote = remote_transport(self.config, "audio-receiver")
 
     def start(self) -> None:
-        self.on_stop(lambda: self.log.info("sound: %s", self._buffer.counters.snapshot()))
+        self.on_stop(lambda: self.log.info("sound: %s", in_words(self._buffer.counters.snapshot())))
         self._thread.start()
         self.on_stop(lambda: self._thread.join(_END_S))
         self._remote.open(timeout=0.0)

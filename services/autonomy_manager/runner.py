@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+_BY_SIGNAL = 128  # exit codes above it: a program that a signal has ended, by itself and in order
+
 
 @dataclass
 class Part:
@@ -214,7 +216,8 @@ class Runner:
         part.ended = True
         if run is not self._run:  # of a run that was closed
             return
-        how = f"exited with code {code}" if code >= 0 else f"was ended by signal {-code}"
+        signal_ = code - _BY_SIGNAL if code > _BY_SIGNAL else -code  # that of a script, and that of the system
+        how = f"exited with code {code}" if 0 <= code <= _BY_SIGNAL else f"was ended by signal {signal_}"
         log.info("%s %s", part.file, how)
         if part is run.main:
             self._service.halt_repeatedly(run.number)

@@ -20,6 +20,7 @@ from pebble.services.camera_publisher.frame_selector import KeyframeRequests
 from pebble.services.camera_publisher.rate_control import RateController, wire_size
 from pebble.services.camera_publisher.shape import Pixels, Shape
 from pebble.transports import QoS, State
+from pebble.transports.counters import in_words
 
 _FPS = 15.0  # where the config names none; the camera's own default
 _POLL_S = 0.02  # between two measurements while a picture is in flight
@@ -61,7 +62,7 @@ class CameraPublisher(Service):
         )
 
     def start(self) -> None:
-        self.on_stop(lambda: self.log.info("pictures: %s", self.counters.snapshot()))
+        self.on_stop(lambda: self.log.info("pictures: %s", in_words(self.counters.snapshot())))
         self._remote.on_state(lambda _state: self.post(self._on_remote))
         self._remote.open(timeout=0.0)
         self.on_stop(self._remote.close)

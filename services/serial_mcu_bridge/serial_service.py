@@ -16,6 +16,7 @@ from pebble.services.serial_mcu_bridge.line.serial_line import LineState, Serial
 from pebble.services.serial_mcu_bridge.line.silence import CHECK_S, Silence
 from pebble.services.serial_mcu_bridge.line.starts import Starts
 from pebble.services.serial_mcu_bridge.moving_sensors import MovingSensors
+from pebble.transports.counters import in_words
 
 _MISREAD = "what its board sends is not understood: another baud rate or firmware, or noise"
 _WARN_S = 60.0
@@ -83,7 +84,7 @@ class SerialService(Service, ABC):
         self.line.close()
         logged, dropped = self.device_log.totals(), self.counters["input_dropped"]
         if logged or dropped:
-            self.log.info("log lines of the MCU: %s; bytes dropped unread: %d", logged, dropped)
+            self.log.info("log lines of the MCU: %s; bytes dropped unread: %d", in_words(logged), dropped)
 
     def _on_line_state(self, state: LineState) -> None:
         if state is LineState.CLOSED:

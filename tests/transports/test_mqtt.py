@@ -447,15 +447,23 @@ def test_a_handshake_may_take_long_while_bytes_arrive(tls_broker: Broker, goes_o
 @pytest.mark.parametrize(
     ("host", "changes", "problem"),
     [
-        ("127.0.0.1", {}, "certificate verify failed"),  # it names localhost
-        ("localhost", {"ca_cert": "other-ca.crt", "insecure": True}, "certificate verify failed"),
+        ("127.0.0.1", {}, "not valid for '127.0.0.1'; name the host as it does"),  # it names localhost
+        (
+            "localhost",
+            {"ca_cert": "other-ca.crt", "insecure": True},
+            "; name its authority: --ca-cert FILE, tls.ca_cert",
+        ),
         ("localhost", {"client_cert": None, "client_key": None}, ""),  # the broker wants one
+        ("localhost", None, "if this port is for TLS: mqtts://"),
+        ("plain", {}, "it takes no TLS at this port; use mqtt://"),
     ],
 )
 def test_tls_checks_host_name_and_authority_and_shows_a_certificate(
-    tls_broker: Broker, clients: Clients, host: str, changes: dict[str, Any], problem: str
+    tls_broker: Broker, broker: Broker, clients: Clients, host: str, changes: dict[str, Any] | None, problem: str
 ) -> None:
-    client = clients(tls_broker.port, host=host, tls=tls(**changes), opened=False)
+    port = {"plain": broker.port}.get(host, tls_broker.port)
+    changed = None if changes is None else tls(**changes)
+    client = clients(port, host=host.replace("plain", "localhost"), tls=changed, opened=False)
     client.open(0.3)
     assert until(lambda: client.problem and problem in client.problem)
     assert client.state is State.CONNECTING

@@ -107,7 +107,7 @@ def test_when_all_fail_one_line_names_each_address_and_its_reason(
         transport.close()
     assert transport.problem.startswith(
         f"broker {NAME}:{port}: {BAD} accepts connections but does not speak MQTT in time; "
-        f"{WORSE} refused us: server unavailable; 127.0.1.1 cannot be reached: [Errno 111] Connection refused; "
+        f"{WORSE} refused us: server unavailable; 127.0.1.1 cannot be reached: nothing listens there, is it up?; "
     )
     assert transport.problem.endswith("; and 6 more")
     assert [record.getMessage() for record in caplog.records] == [f"tool: {transport.problem}"]

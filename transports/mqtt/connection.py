@@ -19,7 +19,7 @@ from pebble.transports.counters import Counters
 from pebble.transports.mqtt.bridge_mode import Result
 from pebble.transports.mqtt.broker_limits import EVERYTHING, Limits
 from pebble.transports.mqtt.client import Client, Opening, TlsLateError, keep_unsent
-from pebble.transports.mqtt.ending import Absent, Lost, Refused, Silent, TlsLate
+from pebble.transports.mqtt.ending import WANTS_TLS, Absent, Lost, Refused, Silent, TlsLate, unreached
 from pebble.transports.mqtt.incoming import OVERSLEPT_S, Incoming, Owner
 from pebble.transports.mqtt.outgoing import (
     Backlog,
@@ -97,7 +97,8 @@ class Connection:
         except (OSError, ValueError) as error:
             # Absent if nothing listens there, TlsLate if TLS takes too long, else Lost.
             ending = next((ending for kind, ending in _UNREACHED.items() if isinstance(error, kind)), Lost)
-            raise ending(f"{self.where} cannot be reached: {error}") from None
+            why = unreached(error, tls=self._settings.tls is not None)
+            raise ending(f"{self.where} cannot be reached: {why}") from None
         self.opened_s = time.monotonic() - dialled
         self.incoming.answered_at = began = clock.since_boot()  # the CONNACK sets it anew
         self.dialling = False
@@ -113,7 +114,8 @@ class Connection:
             raise
         except Lost as lost:
             if self.client.socket is None:  # the broker closed it
-                raise Refused(f"{self.where} hung up on our CONNECT", Result.HUNG_UP) from None
+                fix = "" if self._settings.tls else f"; {WANTS_TLS}"
+                raise Refused(f"{self.where} hung up on our CONNECT{fix}", Result.HUNG_UP) from None
             raise lost from None
         self.max_packet = accepted.max_packet
         stated = Limits(accepted.retain != 0, 1 if accepted.max_qos is None else min(accepted.max_qos, 1))

@@ -37,6 +37,7 @@ log = logging.getLogger(__name__)
 OPEN_SYNC_S = 1.0  # the longest wait for siblings that do not answer, when opening,
 SYNC_S = 0.5  # and when subscribing or reconnecting to the hub
 _RETRY_S = 0.2
+_START = "is the robot up? `pebble up CONFIG` starts it"
 
 
 class ZenohTransport(Transport):
@@ -71,7 +72,7 @@ class ZenohTransport(Transport):
     def _open(self, timeout: float) -> None:
         self._reset()
         prepare_run_dir(self.settings.run_dir)
-        self.problem = f"no hub answers in {self.settings.run_dir}"
+        self.problem = f"no hub answers in {self.settings.run_dir}: {_START}"
         if not self.settings.client:
             self._start_peer()
         name = f"pebble-zenoh {self.client_id}"
@@ -104,7 +105,7 @@ class ZenohTransport(Transport):
             except zenoh.ZError as error:
                 log.debug("%s: %s", self.client_id, error)
                 hubs = ", ".join(self.settings.connect) or self.settings.run_dir / sessions.HUB_SOCKET
-                self.problem = f"no hub answers at {hubs}"
+                self.problem = f"no hub answers at {hubs}: {_START}"
                 watch.wait_closed(_RETRY_S)
                 continue
             if self._begin(watch, session, f"{account}{wire.OF}{new_name()}" if account else new_name()):

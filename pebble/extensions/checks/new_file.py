@@ -8,6 +8,15 @@ from pebble.ownership import owner_of
 from pebble.runtime.whole_file import is_root, sync_file, sync_folder
 
 
+def why_taken(file: Path, suffix: str) -> str:
+    """Return why no new file with this name can be written; empty if it can. ``suffix``: that of such files."""
+    if not file.exists():
+        return ""
+    if file.suffix == suffix:
+        return f"{file} exists: name another file, or remove it"
+    return f"{file} would be overwritten, and is no {suffix} file: name a new one"
+
+
 def write_new(file: Path, content: bytes) -> None:
     """Write a new file that only its owner can read. Raises PebbleError, as root also as :func:`owner_of`."""
     if is_root():

@@ -169,7 +169,7 @@ def conflict(roles: Sequence[str]) -> str:
     """Return why these roles cannot be combined in one account; empty if they can."""
     for role in roles or ("",):  # an account without roles is refused as one with the role ""
         if role not in _RIGHTS:
-            return f"{role!r} is no role: use {', '.join(ROLES)}"
+            return f"{role!r} is no role: use {', '.join(Role)}, or for programs {', '.join(ProgramRole)}"
     if len(set(roles)) == 1 or set(roles) == _GO_TOGETHER:
         return ""
     alone = [role for role in roles if role in _ALONE]

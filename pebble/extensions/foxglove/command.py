@@ -11,6 +11,7 @@ import typer
 from pebble.config.hosts import is_loopback
 from pebble.errors import PebbleError
 from pebble.extensions.operator.client.connection import Target, resolve
+from pebble.extensions.operator.commands import show
 from pebble.extensions.operator.commands.options import BrokerUrl, CaCert, PasswordFile, host_of
 from pebble.runtime.connections import REMOTE_RECONNECT_S
 from pebble.transports import MqttSettings
@@ -77,7 +78,7 @@ def _print_ready(address: str) -> None:
 
 
 def _print_end(summary: Summary) -> None:
-    line = f"Showed {summary.robots} robots in {summary.published:,} messages"
+    line = f"Showed {show.counted(summary.robots, 'robot')} in {show.counted(summary.published, 'message')}"
     if summary.dropped:
         line += f", {summary.dropped:,} dropped"
     if summary.refused:

@@ -10,6 +10,7 @@ from pebble.errors import PebbleError
 from pebble.extensions.metrics.robots import Robots, Samples
 from pebble.extensions.operator.client.broker import Broker
 from pebble.extensions.operator.client.robot_topics import FLEET, SYNONYMS
+from pebble.extensions.operator.notices import say
 from pebble.extensions.operator.signals import ending_event
 from pebble.transports import Message, MqttSettings
 from pebble.transports.counters import bounds_reached
@@ -35,6 +36,7 @@ class Exporter:
                 why = why_not(error, port)
                 raise PebbleError(f"cannot listen on {host} port {port}: {why}; choose another with --port") from None
             await self._broker.open()
+            self._broker.report(say)
             try:
                 for channel in (*FLEET, *SYNONYMS):
                     await self._broker.subscribe(channel.filter("+/+/+"), self._receive)

@@ -83,6 +83,8 @@ class Server:
         self.broker.on_state(self._show_broker)
         self.broker.on_state(self.drivers.renew_keys)
         self._show_broker()
+        if self.settings.say is not None:
+            self.broker.report(self.settings.say)
         for channel in (*FLEET, *SYNONYMS):
             filter_, is_heartbeat = channel.filter("+/+/+"), channel is ONLINE or channel in SYNONYMS
             # Heartbeats are so many that they do not wake the event loop: they wait for _tick.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -41,6 +42,7 @@ class WebSettings:
     cameras_in_turn: bool = False  # for a moment each, while a page shows the fleet: the demo's
     expand: bool = False  # groups of streams
     plain_http_drive: bool = True  # False: over plain http from another machine nothing drives
+    say: Callable[[str], None] | None = None  # gets a line when the broker cannot be reached, and when it can again
 
     @property
     def name(self) -> str:

@@ -12,7 +12,7 @@ from pebble.contract.identity import composed
 from pebble.extensions.recordings.files.reader import DAMAGE, RecordingFile, missing_before
 from pebble.extensions.recordings.files.recorded import ACTIVE, FOREVER_NS, Channel, Recorded, RecordingError
 from pebble.extensions.recordings.library import is_of, merged, robot_of, robots_of
-from pebble.extensions.recordings.recorder.intake import EVENTS
+from pebble.extensions.recordings.recorder.intake import EVENTS, FORGET
 from pebble.transports.topics import matches
 
 _SHOWN_EVENTS: Final = frozenset({"gap", "clock", "dropped", "pruned", "recovered", "damaged", "removed"})
@@ -35,6 +35,11 @@ class FileInfo:
     problem: str = ""  # what could not be read of it now
     topics: Counter[str] = field(default_factory=Counter)  # messages by topic
     robots: set[str] = field(default_factory=set)
+
+    @property
+    def notes(self) -> int:
+        """Return how many of the messages are notes of the recorder."""
+        return self.topics[EVENTS] + self.topics[FORGET]
 
     @property
     def is_active(self) -> bool:

@@ -189,8 +189,10 @@ def test_what_is_in_it_and_what_is_not(places: Places, tmp_path: Path, run: Run)
     assert "security: " in found["doctor.txt"]
     text = "".join(found.values()) + run.out + run.err
     assert [word for word in WORDS if word in text] == []
-    assert run("doctor", "--report", file, "--root", places.root) == 2
-    assert "exists: name another file" in run.err
+    (config := tmp_path / "goob.json").touch()
+    for taken, words in ((file, "exists: name another file"), (config, f": pebble doctor {config} --report {file}")):
+        assert run("doctor", "--report", taken, "--root", places.root) == 2
+        assert words in run.err
 
 
 @pytest.mark.parametrize(

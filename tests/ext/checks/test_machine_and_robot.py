@@ -21,6 +21,7 @@ from pebble.extensions.checks.broker.account import robot_account
 from pebble.extensions.checks.broker.login_attempt import LoginAttempt, attempt
 from pebble.extensions.fleet.folder import ACL, CONF, PASSWORDS
 from pebble.extensions.fleet.roles import Account
+from pebble.transports.mqtt.ending import WANTS_TLS
 from pebble.transports.settings import MqttSettings, TlsSettings
 from tests.ext.fleet.brokers import HOST, FleetBroker
 from tests.support import Broker, free_port, further, listening, until
@@ -154,7 +155,7 @@ OUTSIDE = "127.0.0.2"  # stands for the machine's address on the network
 PLACES = [
     (True, False, State.WARN, f"also answers at {OUTSIDE} and accepts anonymous logins: the network can drive"),
     (True, True, State.OK, f"also answers at {OUTSIDE}, and refuses anonymous logins there"),
-    (False, False, State.OK, f"does not answer at {OUTSIDE}, ::1"),
+    (False, False, State.OK, f"serves this machine only: nothing answers at {OUTSIDE}, ::1"),
 ]
 
 
@@ -187,6 +188,7 @@ ELSEWHERE = [
     *((TLS, LET_IN, LoginAttempt(code=code), ["ok", "ok", "ok"], "encrypted") for code in (4, 134, 135)),
     *((TLS, LET_IN, LoginAttempt(code=code), ["ok", "warn", "ok"], "encrypted") for code in (3, 136)),
     (TLS, LET_IN, LoginAttempt(problem="timed out"), ["ok", "warn", "ok"], "encrypted"),
+    (TLS, SHUT_OUT, SHUT_OUT, ["failed", "ok", "ok"], "pebble fleet password ann, or on the broker: sudo mosquitto_pa"),
     (TLS, LoginAttempt(code=3), SHUT_OUT, ["failed", "ok", "ok"], "its log says why"),
     *(
         (TLS, LoginAttempt(code=code), SHUT_OUT, ["failed", "ok", "ok"], "set remote_mqtt.client_id")
@@ -232,20 +234,21 @@ def test_a_server_that_is_no_broker_is_a_problem() -> None:
 
 #: Where a broker is that cannot be reached, whether this machine has mosquitto, and what to do.
 UNREACHED = [
-    ("127.0.0.1", "mosquitto", "sudo systemctl start mosquitto"),
-    ("127.0.0.1", None, "sudo apt install mosquitto"),
-    ("b.lab", None, "on b.lab: sudo systemctl start mosquitto; or correct the address b.lab:1"),
+    ("127.0.0.1", "mosquitto", "refused", "sudo systemctl start mosquitto"),
+    ("127.0.0.1", None, "refused", "sudo apt install mosquitto"),
+    ("b.lab", None, "refused", "on b.lab: sudo systemctl start mosquitto; or correct the address b.lab:1"),
+    ("b.lab", None, f"refused; {WANTS_TLS}", WANTS_TLS),
 ]
 
 
-@pytest.mark.parametrize(("host", "mosquitto", "fix"), UNREACHED)
+@pytest.mark.parametrize(("host", "mosquitto", "problem", "fix"), UNREACHED)
 def test_a_broker_that_cannot_be_reached(
-    host: str, mosquitto: str | None, fix: str, monkeypatch: pytest.MonkeyPatch
+    host: str, mosquitto: str | None, problem: str, fix: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(login, "attempt", lambda *_, **__: LoginAttempt(problem="refused"))
+    monkeypatch.setattr(login, "attempt", lambda *_, **__: LoginAttempt(problem=problem))
     monkeypatch.setattr(login, "mosquitto_path", lambda: mosquitto)
     (finding,) = login.broker("b", MqttSettings(host=host, port=1))
-    assert finding.fix == fix
+    assert (finding.text, finding.fix) == ("cannot be reached: refused", fix)
 
 
 @pytest.mark.parametrize(
@@ -277,8 +280,12 @@ def test_a_whole_robot_is_examined(tmp_path: Path, broker: Broker) -> None:
     failed = [finding.what.split(" ")[0] for finding in findings if finding.state is State.FAILED]
     assert failed == ["serial", "remote"]
     assert {"memory lock", "clock", "state directory"} <= {finding.what for finding in findings}
-    tried = {finding.text for finding in findings if finding.text.startswith("does not answer at")}
-    assert tried == ({f"does not answer at {', '.join(login.own_addresses())}"} if login.own_addresses() else set())
+    tried = {finding.text for finding in findings if "nothing answers at" in finding.text}
+    assert tried == (
+        {f"serves this machine only: nothing answers at {', '.join(login.own_addresses())}"}
+        if login.own_addresses()
+        else set()
+    )
     assert [finding for finding in findings if finding.state is not State.OK and not finding.fix] == []
 
 

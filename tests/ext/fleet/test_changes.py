@@ -222,7 +222,11 @@ def test_a_fleet_of_the_plugin_becomes_one_of_files(tmp_path: Path, run: Run, mo
         ("Ann", DRIVER, "is no name"),
         ("otto", DRIVER, "exists already, as driver"),
         ("x", Account(roles=()), "is no role"),
-        ("x", Account(roles=("boss",)), "'boss' is no role: use viewer"),
+        (
+            "x",
+            Account(roles=("boss",)),
+            "'boss' is no role: use viewer, driver, maintainer, safety, admin, or for programs page",
+        ),
         ("x", Account(roles=("robot", "driver"), bases=("a/b/c",)), "robot goes with no other role"),
         ("x", Account(roles=("page", "driver")), "page goes with no other role"),
         ("x", Account(roles=("robot",)), "has one base"),

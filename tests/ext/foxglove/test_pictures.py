@@ -129,7 +129,7 @@ def test_a_signal_withdraws_the_requests(broker: Broker) -> None:
         assert until(lambda: watcher.count(H264))
         code, errors = server.end(signal.SIGTERM)
         assert (code, errors.splitlines()[1:]) == (0, [])
-        assert errors.startswith("Showed 1 robots in ")
+        assert errors.startswith("Showed 1 robot in ")
         assert until(lambda: robot.requests[-1] == WITHDRAWN and robot.flags == [True, False])
         assert until(lambda: watcher.closed)
 

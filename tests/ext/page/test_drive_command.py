@@ -313,6 +313,32 @@ def test_the_status_names_a_layout_without_latin_letters_and_a_script_that_drive
     assert cab.driver.status().startswith("goob · goob drives itself: Follow · ")
 
 
+#: What becomes of a request for control that bob has: his robot's state after it, the seconds, the status line.
+ASKED: dict[str, tuple[dict[str, Any], float, str]] = {
+    "it waits": ({"asks": "ann", "asks_id": "{id}"}, 0.5, "asked bob for control · "),
+    "he gives it": ({"by": "ann", "id": "{id}", "key": "k2"}, 0.5, "bob lets you drive · ready"),
+    "he drives on": ({"asks": "ann", "asks_id": "{id}"}, 31, "bob drives on · "),
+    "no answer": ({}, 31, "goob does not answer · "),
+}
+
+
+@pytest.mark.parametrize(("state", "seconds", "words"), ASKED.values(), ids=ASKED)
+def test_who_asks_for_control_sees_that_it_is_asked_for_and_what_came_of_it(
+    state: dict[str, str], seconds: float, words: str
+) -> None:
+    cab = Cab()
+    cab.robot.value["drive"]["control"] = True
+    held = {"by": "bob", "id": "b0b", "key": "k1"}
+    cab.receive(cab.robot.capabilities(), *(owner.state() for owner in cab.robot.owners))
+    cab.receive(outgoing(GOOB, "control/serial", held))
+    cab.run(2.0)
+    cab.run(0.1, "t")
+    id_ = next(json.loads(message.payload)["id"] for message in cab.sent if message.topic == f"{GOOB}/incoming/control")
+    cab.receive(outgoing(GOOB, "control/serial", held | {key: text.format(id=id_) for key, text in state.items()}))
+    cab.run(seconds)
+    assert cab.driver.status().startswith(f"goob · {words}")
+
+
 def test_who_leaves_sends_a_last_zero_and_nothing_more_than_twice_after_it() -> None:
     cab = Cab().ready()
     cab.run(0.5, "w")

@@ -222,6 +222,25 @@ def test_a_port_in_use_is_named(run: Run, broker: Broker) -> None:
     assert run.err.startswith(f"pebble: cannot listen on 127.0.0.1 port {broker.port}: {fact}")
 
 
+def test_it_says_when_the_broker_cannot_be_reached_and_when_it_can_again(tmp_path: Path) -> None:
+    broker = Broker(tmp_path)
+    broker.kill()
+    process, _ = started("--url", f"mqtt://127.0.0.1:{broker.port}", "--port", "0")
+    assert process.stderr is not None
+    lines = [process.stderr.readline()]
+    for change in (broker.start, broker.kill):
+        change()
+        lines.append(process.stderr.readline())
+    process.send_signal(signal.SIGINT)
+    assert process.communicate(timeout=WAIT_S)[1] == ""
+    at = f"broker 127.0.0.1:{broker.port}"
+    assert lines == [
+        f"pebble: {at} cannot be reached: nothing listens there, is it up? (trying again)\n",
+        "pebble: connected to the broker\n",
+        f"pebble: {at} closed the connection (trying again)\n",
+    ]
+
+
 def test_it_serves_https_with_a_certificate_of_ones_own_until_ctrl_c(run: Run, broker: Broker, tmp_path: Path) -> None:
     people = People(tmp_path / "people.sqlite")
     people.add("alice", SECRET, Role.DRIVER)

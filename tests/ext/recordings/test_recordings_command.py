@@ -43,8 +43,10 @@ def messages(folder: Path) -> int:
 
 def test_list_and_info(folder: Path, run: Run) -> None:
     assert run("recordings", "list", folder) == 0
-    assert re.search(r"state +204 ", run.out)
+    assert re.search(r"state +201 ", run.out)
+    assert "1 file, 201 messages, " in run.out
     assert run("recordings", "info", folder) == 0
+    assert re.search(r"201 messages and 3 notes of the recorder, .* in 1 file\n", run.out)
     assert "pebble/robots/goob: 101 messages" in run.out
     assert "100  outgoing/online" in run.out
     assert "gap: why no connection, lasted 60.0 s" in run.out
@@ -54,7 +56,7 @@ def test_search(folder: Path, run: Run) -> None:
     run("recordings", "search", folder, "--robot", "goob", "--topic", "outgoing/logs", "--text", "battery")
     (line,) = run.out.splitlines()
     assert line.endswith('{"level": "WARNING", "message": "low \\n battery"}')
-    assert run.err == "1 messages\n"
+    assert run.err == "1 message\n"
     run("recordings", "search", folder, "-t", f"{FRED}/#", "-n", "3")
     assert len(run.out.splitlines()) == 3
 
@@ -96,7 +98,7 @@ def test_a_robot_is_found_by_a_name_that_looks_the_same(tmp_path: Path, run: Run
     assert run("recordings", "search", tmp_path / "rec", "--robot", "b\u00e4r") == 0
     assert "outgoing/online" in run.out
     assert run("recordings", "rm", tmp_path / "rec", "--robot", "b\u00e4r", "--yes") == 0
-    assert run.out == "1 messages deleted\n"
+    assert run.out == "1 message deleted\n"
 
 
 def test_what_a_recorder_uses_is_left_alone(folder: Path, run: Run) -> None:

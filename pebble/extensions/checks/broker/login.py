@@ -14,6 +14,7 @@ from pebble.extensions.checks.check import SOON_DAYS
 from pebble.extensions.checks.machine import printed
 from pebble.extensions.operator.places import mosquitto_path
 from pebble.transports.mqtt import reasons
+from pebble.transports.mqtt.ending import TLS_FIXES
 from pebble.transports.settings import MqttSettings
 
 #: How to mend what a broker refuses, by its reason; for any other its log says why.
@@ -40,9 +41,10 @@ def broker(
             start = f"on {settings.host}: {start}; or correct the address {settings.host}:{settings.port}"
         elif mosquitto_path() is None:
             start = "sudo apt install mosquitto"
-        yield failed(f"cannot be reached: {answer.problem}", start, what)
+        fix = next((fix for fix in TLS_FIXES if fix in answer.problem), start)
+        yield failed(f"cannot be reached: {answer.problem.replace(f'; {fix}', '')}", fix, what)
         return
-    yield replace(_own_login(settings, answer), what=what)
+    yield replace(_own_login(settings, answer, level), what=what)
     if answer.problem and not is_here:
         fix = f"correct the addresses of {settings.host} in your DNS, or start the brokers there"
         yield warn(f"has addresses that do not answer: {answer.problem}", fix, what)
@@ -51,7 +53,7 @@ def broker(
     yield replace(_encryption(settings, answer, is_here=is_here), what=what)
 
 
-def _own_login(settings: MqttSettings, answer: LoginAttempt) -> CheckResult:
+def _own_login(settings: MqttSettings, answer: LoginAttempt, level: SecurityLevel) -> CheckResult:
     if answer.code == 0:
         return ok(f"answers, and lets it in within {answer.took_ms:.1f} ms")
     why = answer.refusal
@@ -60,7 +62,9 @@ def _own_login(settings: MqttSettings, answer: LoginAttempt) -> CheckResult:
     if settings.username is None:
         return failed(f"refuses the login: {why}", "set username and password_file of this broker")
     user = shown_user(settings.username)
-    fix = f"on the broker: sudo mosquitto_passwd /etc/mosquitto/passwd {user}"
+    fix = f"put the password of {user} into its password_file; a new one: pebble fleet password {user}"
+    if level == "open":  # perhaps no fleet
+        fix += f", or on the broker: sudo mosquitto_passwd /etc/mosquitto/passwd {user}"
     return failed(f"refuses user {user}: {why}", fix)
 
 
@@ -111,7 +115,7 @@ def beyond_loopback(name: str, settings: MqttSettings, addresses: Iterable[str])
     elif answering:
         yield ok(f"also answers at {', '.join(answering)}, and refuses anonymous logins there", what=what)
     elif answers:
-        yield ok(f"does not answer at {', '.join(answers)}", what=what)
+        yield ok(f"serves this machine only: nothing answers at {', '.join(answers)}", what=what)
 
 
 def own_addresses() -> list[str]:

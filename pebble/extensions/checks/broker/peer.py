@@ -21,6 +21,7 @@ from pebble.transports.credentials import Credentials
 from pebble.transports.hosts import Address
 from pebble.transports.mqtt import client_ids, packets, reasons
 from pebble.transports.mqtt.client import Client, Opening
+from pebble.transports.mqtt.ending import WANTS_TLS, unreached
 from pebble.transports.settings import MqttSettings
 
 ANSWER_S = 3.0  # within which a broker answers, and four round trips
@@ -31,6 +32,7 @@ _KEEPALIVE_S = 60
 _AT_ONCE = 1000  # packets
 _MOST, _MOST_BYTES = 5_000, 20_000_000  # that one connection reads; a probe sends a thousand messages
 _ANSWER_BYTES = 1000  # for which an answer counts, so that an end comes to 20,000 of them
+_HANGS_UP = ("it hangs up", f"it hangs up; {WANTS_TLS}")
 _BAD = (State.WARN, State.FAILED)
 _RESET = struct.pack("ii", 1, 0)  # SO_LINGER that turns close() into a reset
 
@@ -249,11 +251,11 @@ class BrokerTrial:
         try:
             peer = Peer(self, self.base, opening, bridge=bridge)
         except OSError as error:
-            raise RefusedError(getattr(error, "reason", None) or error.strerror or str(error)) from None
+            raise RefusedError(unreached(error, tls=settings.tls is not None)) from None
         self._peers.append(peer)
         self.wait(lambda: peer.code is not None or peer.closed, _MORE_PATIENCE * self.answer_s)
         if peer.code != 0:
-            why = peer.problem or ("it hangs up" if peer.closed else "it does not answer")
+            why = peer.problem or (_HANGS_UP[settings.tls is None] if peer.closed else "it does not answer")
             peer.leave()
             raise RefusedError(why, peer.code)
         return peer

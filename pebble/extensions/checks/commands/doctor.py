@@ -12,7 +12,7 @@ from pebble.config import load
 from pebble.config.hosts import is_loopback
 from pebble.errors import PebbleError
 from pebble.extensions.checks.commands.checks import Printer, is_clear
-from pebble.extensions.checks.new_file import write_new
+from pebble.extensions.checks.new_file import why_taken, write_new
 from pebble.extensions.operator.commands.estop import me
 from pebble.extensions.operator.commands.options import CaCert, PasswordFile, RootOption
 from pebble.extensions.operator.commands.target import broker_of
@@ -139,8 +139,9 @@ def _report(file: Path, config: Path | None, places: Places) -> int:
     """Write the zip file; without a config it is about the installed robot."""
     from pebble.extensions.checks.report.report import make  # of Linux only
 
-    if file.exists():
-        raise typer.BadParameter(f"{file} exists: name another file, or remove it")
+    if taken := why_taken(file, ".zip"):
+        meant = f": pebble doctor {file} --report {file.with_suffix('.zip')}" if file.suffix == ".json" else ""
+        raise typer.BadParameter(taken + meant)
     if config is not None and not config.exists():
         raise typer.BadParameter(f"{config} does not exist: name a robot's config file")
     report = make(places, None if config is None else config.absolute())

@@ -92,7 +92,9 @@ def init(
     with as_owner(place, *LAZY_MODULES, make=True):
         applying.make(place, fleet, others=others)
     typer.echo(f"{_shown(place)} has all files of a broker at {server.host}:{server.port}, level {fleet.level}.")
-    typer.echo(f"Start it:\n    mosquitto -c {_shown(place / CONF)}")
+    typer.echo(f"Start it, then add who may use it:\n    mosquitto -c {_shown(place / CONF)}")
+    for account in ("ann --role driver", "goob --role robot"):
+        typer.echo(f"    pebble fleet add {account} --folder {_shown(place)}")
     if place.stat().st_uid == 0:
         typer.echo("It will run as root, as whom these files were made: a user of its own would do.")
     typer.echo(f"Keep {_shown(place)} secret, and a copy of it: its keys are in it.")

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from pebble.extensions.checks.new_file import write_new
+from pebble.extensions.checks.new_file import why_taken, write_new
 from pebble.extensions.operator.client.page_packages import require_packages
 from pebble.extensions.operator.places import Places
 
@@ -51,8 +51,8 @@ def back_up(file: Path, places: Places) -> int:
     """Write the backup as a tar file, and read it again to check it."""
     from pebble.extensions.install.setup import backup as backups  # imports what only Linux has
 
-    if file.exists():
-        raise typer.BadParameter(f"{file} exists: name another file, or remove it")
+    if taken := why_taken(file, ".tar"):
+        raise typer.BadParameter(taken)
     backup = backups.make(places)
     write_new(file, backups.packed(backup))
     written = backups.read(file)  # as the disk has it

@@ -118,6 +118,23 @@ class Broker:
         """Call ``watcher`` whenever the connection is made or lost."""
         self._watchers.append(watcher)
 
+    def report(self, say: Callable[[str], None]) -> None:
+        """Give ``say`` a line if there is no connection, and from now on when it is lost, and when it is made again.
+
+        On threads of its own: a terminal that stands still holds up no message.
+        """
+        reported = True  # the state in the last line
+
+        def note() -> None:
+            nonlocal reported
+            if self.connected is not reported and self.transport.state is not State.CLOSED:
+                reported = self.connected
+                line = "connected to the broker" if reported else f"{self.problem} (trying again)"
+                threading.Thread(target=say, args=(line,), name="pebble-say", daemon=True).start()
+
+        self.on_state(note)
+        note()
+
     def publish(
         self,
         topic: str,

@@ -5,7 +5,7 @@ import os
 import queue
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -19,6 +19,7 @@ from pebble.extensions.operator.client.names import ANY_ROBOT, Names, base_of, s
 from pebble.extensions.operator.client.robot_estop import RobotEstop
 from pebble.extensions.operator.client.url import password as password
 from pebble.extensions.operator.client.url import settings_of
+from pebble.extensions.operator.notices import PATIENCE_S, noticed
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.connections import REMOTE_RECONNECT_S, local_settings, mqtt_settings, zenoh_settings
 from pebble.transports import Message, MqttSettings, QoS, State, Transport, create
@@ -59,20 +60,37 @@ def target_of(robot: str | None, options: Target) -> Target:
 
 
 @contextmanager
-def connected(target: Target, *, needed: bool = True) -> Iterator[tuple[Transport, Names]]:
+def connected(
+    target: Target, *, needed: bool = True, undone: str = "", patience_s: float = PATIENCE_S
+) -> Iterator[tuple[Transport, Names]]:
     """Connect, and disconnect at the end. Raises PebbleError with a remedy if the connection fails.
 
-    ``needed`` False: a connection that cannot be made yet is tried again and again in the ``with`` block.
+    ``needed`` False: a connection that cannot be made yet is tried again and again in the ``with`` block. If it takes
+    longer than ``patience_s``, a line says so. ``undone``: as in :func:`connecting`.
     """
     kind, settings, names, where = resolve(target)
     transport = create(kind, f"pebble-tool-{os.getpid()}", in_small_segments(settings))
-    with closing(transport.open(OPEN_TIMEOUT_S)):
+    with closing(transport):
+        with connecting(where, lambda: transport.problem, undone, patience_s):
+            transport.open(OPEN_TIMEOUT_S)
         if needed and transport.state is not State.CONNECTED:
             why = transport.problem or f"no answer within {OPEN_TIMEOUT_S:g} s"
             raise TransportError(f"cannot connect to {where}: {why}")
         not_received = _report_missing(transport)  # in words
         yield transport, _as_spelled(transport, names) if needed else names
         _report_missing(transport, not_received)  # what was subscribed to meanwhile may be refused
+
+
+def connecting(
+    where: str, problem: Callable[[], str], undone: str = "", patience_s: float = PATIENCE_S
+) -> AbstractContextManager[None]:
+    """Return a context in which a line says after ``patience_s`` that there is no connection yet.
+
+    ``undone``: what has to wait for it, as the line then begins; it ends with the ``problem``.
+    """
+    return noticed(
+        lambda: ": ".join(filter(None, (undone, f"connecting to {where}", undone and problem()))), patience_s
+    )
 
 
 def _as_spelled(transport: Transport, names: Names) -> Names:
@@ -161,9 +179,7 @@ def _of_config(config: Config, target: Target) -> tuple[str, Any, Names, str]:
         return kind, settings, Names(base, addresses, _account(settings)), f"the remote side of {config.base}"
     names = Names(base, addresses)
     if config.transport.kind == "zenoh":
-        start = f"pebble up {config.path or 'CONFIG'}"
-        where = f"the hub of {config.base} in {config.run_dir()} (is the robot up? `{start}` starts it)"
-        return "zenoh", zenoh_settings(config, client=True), names, where
+        return "zenoh", zenoh_settings(config, client=True), names, f"the hub of {config.base}"
     where = f"{config.base} by {config.transport.kind}"
     if config.transport.kind == "mqtt":
         where = f"the broker of {config.base} at {config.local_mqtt.host}:{config.local_mqtt.port}"

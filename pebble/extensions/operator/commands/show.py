@@ -124,6 +124,11 @@ def duration(seconds: float) -> str:
     return f"{seconds:.0f} s"
 
 
+def counted(number: int, noun: str) -> str:
+    """Return a number of things: ``1 file``, ``1,200 messages``."""
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
 def size(count: float) -> str:
     """Return a size: ``19 B``, ``1.2 kB``, ``3.4 MB``."""
     if count < 1000:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pebble.errors import PebbleError
 from pebble.extensions.operator.commands.options import (
     CaCert,
     ConfigOption,
@@ -48,6 +49,9 @@ def with_target(*, program: str = "tool", robot: bool = False) -> Callable[[Call
                 Target,  # not all commands that use this module connect
             )
 
+            for value in given.values() if robot else ():
+                if isinstance(value, str) and value.endswith(".json") and Path(value).is_file():
+                    raise PebbleError(f"{value} is a config file: use -c {value}")
             target = {option.name: given.pop(option.name) for option in (*options, *_CREDENTIALS)}
             return command(**given, target=Target(**target, program=program))
 

@@ -247,7 +247,10 @@ def _estop(transport: Transport, names: Names, topic: str) -> RobotEstop | None:
 
 def _warn_of_dropped(listener: Listener) -> None:
     if listener.dropped:
-        typer.echo(f"pebble: warning: {listener.dropped} messages arrived faster than they were printed", err=True)
+        typer.echo(
+            f"pebble: warning: {show.counted(listener.dropped, 'message')} arrived faster than they were printed",
+            err=True,
+        )
 
 
 def _end(seconds: float | None) -> float:

@@ -13,6 +13,7 @@ from pebble.config import load
 from pebble.errors import PebbleError
 from pebble.extensions.operator.client.connection import Target, connected, put_account_into_topics
 from pebble.extensions.operator.commands.options import BrokerUrl, CaCert, PasswordFile
+from pebble.extensions.operator.notices import noticed
 from pebble.extensions.operator.signals import interrupted_by_signals
 from pebble.runtime.as_owner import as_owner
 from pebble.runtime.whole_file import write
@@ -71,14 +72,15 @@ def _received(target: Target, encoding: str | None) -> Picture:
 
     with connected(target) as (transport, names), closing(MediaReceiver(transport, names.base)) as receiver:
         put_account_into_topics(transport, names, lambda base: base == names.base and receiver.robot.named)
-        receiver.wait_for_capabilities(_CAPABILITIES_TIMEOUT_S)
-        receiver.request("video", encoding)
-        end = time.monotonic() + _FIRST_PICTURE_S
-        while receiver.newest is None:
-            if time.monotonic() > end:
-                raise PebbleError(f"no picture came from {receiver.robot.name} within {_FIRST_PICTURE_S:.0f} s")
-            receiver.poll()
-            time.sleep(_TICK_S)
+        with noticed(lambda: f"waiting for a picture of {receiver.robot.name}"):
+            receiver.wait_for_capabilities(_CAPABILITIES_TIMEOUT_S)
+            receiver.request("video", encoding)
+            end = time.monotonic() + _FIRST_PICTURE_S
+            while receiver.newest is None:
+                if time.monotonic() > end:
+                    raise PebbleError(f"no picture came from {receiver.robot.name} within {_FIRST_PICTURE_S:.0f} s")
+                receiver.poll()
+                time.sleep(_TICK_S)
         return receiver.newest.picture
 
 

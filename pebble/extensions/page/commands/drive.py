@@ -77,8 +77,7 @@ def _drive(transport: Transport, driver: TerminalDriver, terminal: Terminal) -> 
         for message in driver.tick(clock(), problem_of(transport)):
             transport.publish(message.topic, message.payload, qos=message.qos, urgent=True)
 
-    for filter_ in driver.filters:
-        transport.subscribe(filter_, receive, qos=QoS.DELIVERED, direct=True)
+    transport.subscribe_all(dict.fromkeys(driver.filters, receive), qos=QoS.DELIVERED, direct=True)
     try:
         while not terminal.ended:
             keys = terminal.keys(PERIOD_S)
@@ -88,6 +87,8 @@ def _drive(transport: Transport, driver: TerminalDriver, terminal: Terminal) -> 
     finally:
         began = clock()
         driver.end(began, leave=True)
+        if driver.unconfirmed:
+            terminal.show(lambda: f"{driver.name}: the emergency stop is sent for {_STOP_S:g} s more", at_once=True)
         while clock() < began + (_STOP_S if driver.unconfirmed else _ZEROS_S):
             tick()
             time.sleep(PERIOD_S)

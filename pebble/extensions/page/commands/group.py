@@ -22,6 +22,7 @@ from pebble.extensions.fleet.people import has_user
 from pebble.extensions.operator.client.page_packages import require_packages
 from pebble.extensions.operator.commands.options import BrokerUrl, CaCert, PasswordFile, host_of
 from pebble.extensions.operator.commands.target import broker_of
+from pebble.extensions.operator.notices import say
 from pebble.extensions.operator.signals import until_ended
 from pebble.extensions.page.commands.people import TLS, PeopleOption, default_folder, register_people
 from pebble.extensions.page.config import PEOPLE, WebInterface, WebTls
@@ -215,7 +216,7 @@ def _run(settings: WebSettings) -> int:
     for number in hangups:  # the terminal was closed: end as with Ctrl-C, which stops what pages move
         signal.signal(number, lambda *_: signal.raise_signal(signal.SIGINT))
     with until_ended():  # uvicorn raises SIGTERM again once it has ended in order
-        run(settings, on_ready=lambda url: _print_ready(settings, url))
+        run(replace(settings, say=say), on_ready=lambda url: _print_ready(settings, url))
     return 0
 
 

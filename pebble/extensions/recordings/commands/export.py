@@ -87,7 +87,7 @@ def import_(
         writer.metadata("pebble.recording", {"format": "1", "imported": source.name})
         counted = _import(read_lines(file), Copy(writer))
         writer.finish()
-    typer.echo(f"{target}: {counted['messages']:,} messages")
+    typer.echo(f"{target}: {show.counted(counted['messages'], 'message')}")
     if counted["bad"]:
         typer.echo(f"pebble: {counted['bad']:,} lines hold no message and were left out", err=True)
     if counted["truncated"]:
@@ -112,7 +112,7 @@ def _export(
         return f"{target}: {show.duration(write_wav(messages, target, robot).seconds)} of sound"
     with unfinished(target) as path, path.open("wb") as out:
         count = write_lines(messages, out) if form is Form.LINES else write_copy(messages, out)
-    return f"{target}: {count:,} messages"
+    return f"{target}: {show.counted(count, 'message')}"
 
 
 def _import(lines: Iterable[Recorded | BadLine], copy: Copy) -> Counter[str]:

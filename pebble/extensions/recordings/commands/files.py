@@ -10,6 +10,7 @@ import typer
 from pebble.config.visible import shown
 from pebble.errors import PebbleError
 from pebble.extensions.operator.client.names import base_of
+from pebble.extensions.operator.commands import show
 from pebble.extensions.recordings.catalogue import Query, check_names
 from pebble.extensions.recordings.commands.options import RobotOption, Since, Until, period
 from pebble.extensions.recordings.commands.progress import progress
@@ -87,7 +88,7 @@ def _rm(recordings: Folder, base: str | None, period_ns: tuple[int, int], keeps:
     what = f"{shown(base)} " if base else "everything "
     if period_ns != (0, FOREVER_NS):
         typer.echo(f"{what}{period_words(*period_ns)}")
-    if not yes and not typer.confirm(f"Delete {what}from {len(due)} files in {recordings.root}?"):
+    if not yes and not typer.confirm(f"Delete {what}from {show.counted(len(due), 'file')} in {recordings.root}?"):
         return 1
     deleted = 0
     with progress("deleting", len(due)) as advance:
@@ -104,7 +105,7 @@ def _rm(recordings: Folder, base: str | None, period_ns: tuple[int, int], keeps:
                 if not copy.messages:
                     path.unlink()
             advance(number)
-    typer.echo(f"{deleted:,} messages deleted")
+    typer.echo(f"{show.counted(deleted, 'message')} deleted")
     if unsure:
         typer.echo(
             f"pebble: {unsure} files may hold more of it: pebble recordings rm FILE deletes one as a whole", err=True
@@ -145,7 +146,7 @@ def _mend_file(source: Path, target: Path | None) -> int:
         raise PebbleError(f"{target} exists already")
     with as_owner(target.parent), errors_of_files(target):
         copy = rewrite(source, target)
-    typer.echo(f"{target}: {copy.messages:,} messages, {copy.missing:,} missing")
+    typer.echo(f"{target}: {show.counted(copy.messages, 'message')}, {copy.missing:,} missing")
     report_unread([f"{source}: {copy.unread}"] if copy.unread else [])
     return 0 if copy.messages else 1
 
@@ -162,7 +163,7 @@ def _mend_all(folder: Folder) -> int:
             failed = True
             continue
         failed = failed or not copy.is_whole
-        typer.echo(f"{finished_path(path).name}: {copy.messages:,} messages, {copy.missing:,} missing")
+        typer.echo(f"{finished_path(path).name}: {show.counted(copy.messages, 'message')}, {copy.missing:,} missing")
     if not unfinished:
         typer.echo("nothing to mend")
     return 1 if failed else 0

@@ -32,11 +32,13 @@ def list_(places: RecordingsArgument, since: Since = None, until: Until = None, 
     for info in looked:
         lasts = show.duration((info.last_ns - info.first_ns) / 1e9) if info.messages else ""
         begins = local_time(info.first_ns) if info.messages else ""
-        rows.append((begins, lasts, _lane(info.path), f"{info.messages:,}", show.size(info.size), _state(info)))
-        total.update(files=1, messages=info.messages, size=info.size)
+        messages = info.messages - info.notes
+        rows.append((begins, lasts, _lane(info.path), f"{messages:,}", show.size(info.size), _state(info)))
+        total.update(files=1, messages=messages, size=info.size)
     columns = ("begins", "lasts", "what", "messages", "size", "state")
     show.print_table(columns, rows, whole=("begins", "lasts"), right=("messages", "size"))
-    typer.echo(f"{total['files']} files, {total['messages']:,} messages, {show.size(total['size'])}")
+    files_, messages_ = show.counted(total["files"], "file"), show.counted(total["messages"], "message")
+    typer.echo(f"{files_}, {messages_}, {show.size(total['size'])}")
     return report_unread(unread)
 
 
@@ -46,23 +48,25 @@ def info(places: RecordingsArgument, since: Since = None, until: Until = None, c
     topics = Counter[str]()
     for info in looked:
         topics.update(info.topics)
-    messages, size = sum(info.messages for info in looked), sum(info.size for info in looked)
+    notes, size = sum(info.notes for info in looked), sum(info.size for info in looked)
+    messages = sum(info.messages for info in looked) - notes
     filled = [info for info in looked if info.messages]
     if filled:
         begin, end = min(info.first_ns for info in filled), max(info.last_ns for info in filled)
         typer.echo(f"{local_time(begin)} to {local_time(end)} ({show.duration((end - begin) / 1e9)})")
-    typer.echo(f"{messages:,} messages, {show.size(size)} in {len(looked)} files")
+    own = f" and {show.counted(notes, 'note')} of the recorder" if notes else ""
+    typer.echo(f"{show.counted(messages, 'message')}{own}, {show.size(size)} in {show.counted(len(looked), 'file')}")
     missing = sum(info.missing for info in looked)
     if missing:
         typer.echo(f"{missing:,} messages are missing: files were damaged")
     for robot in sorted(set().union(*(info.robots for info in looked))):
         counts = Counter({topic[len(robot) + 1 :]: n for topic, n in topics.items() if robot_of(topic) == robot})
-        typer.echo(f"\n{one_line(shown(robot))}: {counts.total():,} messages")
+        typer.echo(f"\n{one_line(shown(robot))}: {show.counted(counts.total(), 'message')}")
         _print_topics(counts)
     no_robots = (topic for topic in topics if robot_of(topic) is None and not topic.startswith("$recorder/"))
     counts = Counter({topic: topics[topic] for topic in no_robots})
     if counts:
-        typer.echo(f"\nTopics that are of no robot: {counts.total():,} messages")
+        typer.echo(f"\nTopics that are of no robot: {show.counted(counts.total(), 'message')}")
     _print_topics(counts)
     _print_events(info.path for info in looked if info.readable)
     return report_unread(unread)
@@ -92,7 +96,7 @@ def search(
         matches += 1
         if matches == count:
             break
-    typer.echo(f"{matches:,} messages", err=True)
+    typer.echo(show.counted(matches, "message"), err=True)
     return report_unread(problems(damages))
 
 

@@ -11,7 +11,7 @@ from typing import Annotated, Final
 import typer
 
 from pebble.errors import PebbleError
-from pebble.extensions.operator.client.connection import Target, resolve
+from pebble.extensions.operator.client.connection import Target, connecting, resolve
 from pebble.extensions.operator.commands import show
 from pebble.extensions.operator.commands.target import with_target
 from pebble.extensions.operator.signals import interrupted_by_signals
@@ -86,7 +86,8 @@ def _run(recorder: Recorder, source: Source, where: str, length: str | None) -> 
         try:
             recorder.start()
             stack.callback(recorder.stop)
-            source.start()
+            with connecting(where, lambda: ""):
+                source.start()
             stack.callback(source.close)
             _print_start(source, where, recorder.folder.root)
             _serve(recorder, source, ends_at)
@@ -122,7 +123,7 @@ def _serve(recorder: Recorder, source: Source, ends_at: float | None) -> None:
 
 def _line(recorder: Recorder, source: Source, seconds_: float) -> str:
     counters = recorder.counters
-    parts = [show.duration(seconds_), f"{counters['messages']:,} messages", show.size(counters["bytes"])]
+    parts = [show.duration(seconds_), show.counted(counters["messages"], "message"), show.size(counters["bytes"])]
     if counters["dropped"]:
         parts.append(f"{counters['dropped']:,} dropped")
     if not source.connected:
@@ -143,7 +144,7 @@ def _print_end(recorder: Recorder, into: Path) -> None:
     counters = recorder.counters
     lost = f", {counters['dropped']:,} dropped" if counters["dropped"] else ""
     typer.echo(
-        f"Recorded {counters['messages']:,} messages ({show.size(counters['bytes'])}){lost}; "
+        f"Recorded {show.counted(counters['messages'], 'message')} ({show.size(counters['bytes'])} of payload){lost}; "
         f"`pebble recordings info {into}` shows them",
         err=True,
     )

@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from tests.ext.page.served import Served
 from tests.fakes.bad_brokers import BEHAVIOURS, resolving, serving
 from tests.kit.played_robot import RecordingRobot
 from tests.sparing_broker import SparingBroker
-from tests.support import WAIT_S, Broker, free_port, quickly, until
+from tests.support import WAIT_S, Broker, free_port, until
 from tests.tcp_proxy import TcpProxy
 
 _numbers = itertools.count(1)
@@ -173,6 +173,14 @@ def test_a_robot_that_does_not_answer_is_reported_and_ctrl_c_ends_it(robot_on: M
     assert robot.count("estop") == robot.count("drive-values") >= 2
 
 
+def test_the_robots_that_are_heard_are_named_where_the_one_that_is_meant_is_not(robot_on: Make, url: str) -> None:
+    robot = robot_on("serial")
+    robot.start()
+    with running("estop", "gob", url) as process:
+        assert process.stderr is not None
+        assert process.stderr.readline() == f"pebble: nothing comes from gob; heard here: {robot.id}\n"
+
+
 def test_a_stop_is_repeated_until_it_is_confirmed_although_nothing_can_be_printed(robot_on: Make, url: str) -> None:
     robot = robot_on("serial")
     robot.deaf = True
@@ -184,6 +192,23 @@ def test_a_stop_is_repeated_until_it_is_confirmed_although_nothing_can_be_printe
         _, err = process.communicate(timeout=WAIT_S)
     assert (process.returncode, err) == (0, "")
     assert robot.latched
+
+
+def test_a_terminal_that_stands_still_holds_no_stop_up(robot_on: Make, broker: Broker) -> None:
+    robot = robot_on("serial")
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+    with suppress(BlockingIOError):
+        while os.write(writing, b"x" * 4096):
+            pass
+    os.set_blocking(writing, True)
+    with (
+        os.fdopen(reading),
+        os.fdopen(writing, "w") as unread,
+        TcpProxy(broker.port, delay_s=0.3) as proxy,
+        running("estop", robot.id, f"--url=mqtt://127.0.0.1:{proxy.port}", stderr=unread),
+    ):
+        assert until(lambda: robot.latched)
 
 
 def test_a_slow_network_does_not_delay_repetitions(robot_on: Make, broker: Broker) -> None:
@@ -244,14 +269,10 @@ def brittle(tmp_path: Path) -> Iterator[Broker]:
     broker.stop()
 
 
-def await_outage(process: subprocess.Popen[str]) -> None:
+def await_stop(process: subprocess.Popen[str], broker: Broker, robot: RecordingRobot, waits: str) -> None:
+    """Start the broker once the command says that it ``waits``, and await the confirmation."""
     assert process.stderr is not None
-    assert process.stderr.readline().startswith("pebble: warning: nothing is sent until there is a connection: ")
-
-
-def await_stop(process: subprocess.Popen[str], broker: Broker, robot: RecordingRobot) -> None:
-    """Start the broker once the command says that it waits, and await the confirmation."""
-    await_outage(process)
+    assert process.stderr.readline().startswith(f"pebble: {waits}")
     robot.deaf = False
     broker.start()
     out, _ = process.communicate(timeout=50)
@@ -266,26 +287,74 @@ def test_a_lost_broker_is_waited_for(brittle: Broker) -> None:
         with running("estop", robot.id, f"--url=mqtt://127.0.0.1:{brittle.port}") as process:
             assert until(lambda: robot.count("estop") >= 1)
             brittle.kill()
-            await_stop(process, brittle, robot)
+            await_stop(process, brittle, robot, "warning: nothing is sent until there is a connection: ")
 
 
 def test_a_broker_that_restarts_is_waited_for(brittle: Broker) -> None:
     with RecordingRobot(brittle.port, "pebble/robots/lost", heartbeats=False) as robot:
         brittle.kill()
         with running("estop", robot.id, f"--url=mqtt://127.0.0.1:{brittle.port}") as process:
-            await_stop(process, brittle, robot)
+            await_stop(process, brittle, robot, "the stop is NOT SENT YET: connecting to mqtt://127.0.0.1:")
 
 
-def test_without_a_broker_nothing_is_sent_and_that_is_said(run: Run) -> None:
-    nowhere = f"--url=mqtt://127.0.0.1:{free_port()}"
-    with quickly(WAIT_S):  # half the time for which a stop is repeated
-        assert run("estop", "--all", nowhere) == 1
-    assert run.err.startswith("pebble: cannot connect to ")
-    with running("estop", "goob", nowhere) as process:
-        await_outage(process)
+NOWHERE = "nothing listens there, is it up?"
+REFUSED = "not authorized (bad user name or password?)"
+#: Command lines whose broker, or robot, does not let them in: how it answers, the first line, a later signal, the end.
+UNREACHED: dict[str, tuple[list[str], str | None, str, str, signal.Signals | None, str]] = {
+    "one": (["goob"], None, "the stop is NOT SENT YET: connecting to", NOWHERE, signal.SIGINT, "STOP NOT SENT: interr"),
+    "ended": (["goob"], "mute", "the stop is NOT SENT YET: connecting to", "", signal.SIGTERM, "STOP NOT SENT: interr"),
+    "all": (["--all"], None, "the stop is NOT SENT YET: connecting to", NOWHERE, None, "STOP NOT SENT: cannot connect"),
+    "who": (["--all"], "not authorized", "the stop is NOT SENT YET: connecting to", REFUSED, None, REFUSED),
+    "reset": (
+        ["reset", "goob"],
+        None,
+        "nothing is reset yet: connecting to",
+        NOWHERE,
+        signal.SIGINT,
+        "NOT RESET: interr",
+    ),
+}
+
+
+@pytest.mark.parametrize(("words", "how", "begins", "why", "ends_by", "ends"), UNREACHED.values(), ids=UNREACHED)
+def test_without_a_connection_a_stop_and_a_reset_say_at_once_and_in_the_end_that_they_are_not_sent(
+    words: list[str], how: str | None, begins: str, why: str, ends_by: signal.Signals | None, ends: str
+) -> None:
+    port = free_port()
+    with ExitStack() as opened:
+        if how is not None:
+            opened.enter_context(serving("127.0.0.1", port, BEHAVIOURS[how]))
+        process = opened.enter_context(running("estop", *words, f"--url=mqtt://127.0.0.1:{port}"))
+        assert process.stderr is not None
+        first = process.stderr.readline()
+        if ends_by is not None:
+            process.send_signal(ends_by)
+        _, err = process.communicate(timeout=WAIT_S)
+    assert first.startswith(f"pebble: {begins} mqtt://127.0.0.1:{port}")
+    assert (process.returncode, why in first, ends in err, "Traceback" in err) == (1, True, True, False), first + err
+
+
+def test_a_stop_that_waits_for_a_broker_says_why_until_it_is_ended() -> None:
+    with running("estop", "goob", f"--url=mqtt://127.0.0.1:{free_port()}") as process:
+        assert process.stdout is not None
+        waits = process.stdout.readline()
         process.send_signal(signal.SIGINT)
         out, _ = process.communicate(timeout=WAIT_S)
-    assert (process.returncode, out) == (1, "goob: STOP NOT SENT: there was no connection\n")
+    assert (process.returncode, waits.startswith("goob: STOP NOT SENT YET: ")) == (1, True)
+    assert out == waits.replace(" YET", "")
+
+
+@pytest.mark.parametrize("place", ["target_of", "_repeat"])
+def test_a_stop_says_also_after_an_error_whether_it_was_sent(
+    run: Run, monkeypatch: pytest.MonkeyPatch, broker: Broker, url: str, place: str
+) -> None:
+    def fail(*_: object) -> None:
+        raise ValueError("a mistake")
+
+    monkeypatch.setattr(estop, place, fail)
+    assert run("estop", "nobody", url) == 1
+    assert ("STOP NOT SENT: an unexpected error" in run.err) is (place == "target_of")
+    assert (run.out.startswith("nobody: ") and " NOT " in run.out) is (place == "_repeat")
 
 
 #: What a broker keeps, too long to arrive, of a stranger or of the robot itself, and who stops the robot all the same.
@@ -440,7 +509,7 @@ def test_a_stop_that_was_not_shown_is_not_reset(robot_on: Make, url: str) -> Non
 def test_a_reset_of_an_unknown_robot_is_a_failure(run: Run, url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(estop, "_ANSWER_S", 0.3)
     assert run("estop", "reset", "unknown", url) == 1
-    assert run.err == "pebble: unknown publishes no emergency stop: is it on, and is this its broker?\n"
+    assert run.err == "pebble: NOT RESET: unknown publishes no emergency stop: is it on, and is this its broker?\n"
 
 
 def test_status_of_all(run: Run, robot_on: Make, url: str) -> None:
@@ -479,7 +548,7 @@ def test_a_stopped_robot_is_not_driven_unless_forced(run: Run, robot_on: Make, u
     assert f"pebble estop reset {robot.id}" in run.err
     assert run("topic", "pub", f"{robot.base}/incoming/drive-values", "{}", url) == 0, "a zero moves nothing"
     assert run("topic", "pub", "lights-solid", "{}", url, f"--robot={robot.id}") == 0
-    assert robot.count("drive-values") == 2
+    assert until(lambda: robot.count("drive-values") == 2)
     assert run(*drive, "--force") == 0
     assert until(lambda: robot.count("drive-values") == 3)
 

@@ -144,6 +144,7 @@ def test_an_outage_is_a_gap(tmp_path: Path) -> None:
 def test_there_is_no_broker_yet(tmp_path: Path) -> None:
     with program("record", "--url", "mqtt://127.0.0.1:1", "--into", tmp_path / "rec", "--for", "1s") as process:
         assert process.stderr is not None
+        assert process.stderr.readline() == "pebble: connecting to mqtt://127.0.0.1:1\n"
         assert "cannot connect to mqtt://127.0.0.1:1 yet" in process.stderr.readline()
         assert process.wait(WAIT_S) == 0
 

@@ -128,7 +128,13 @@ def test_only_the_newest_request_counts_while_another_script_ends(bench: Bench) 
 
 
 @pytest.mark.parametrize(
-    ("code", "error"), [(0, None), (3, "walk exited with code 3"), (-9, "walk was ended by signal 9")]
+    ("code", "error"),
+    [
+        (0, None),
+        (3, "walk exited with code 3"),
+        (-9, "walk was ended by signal 9"),
+        (143, "walk was ended by signal 15"),
+    ],
 )
 def test_an_end_stops_the_wheels_and_nothing_is_started_again(bench: Bench, code: int, error: str | None) -> None:
     walk = bench.start("walk")

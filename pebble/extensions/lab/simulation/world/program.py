@@ -6,7 +6,7 @@ import sys
 import tempfile
 import threading
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -44,6 +44,8 @@ def run(file: Path, folder: Path | None = None, *, trace: Path | None = None, co
     except OSError as error:
         raise DeviceError(f"{error.filename}: {error.strerror}") from None
     with ExitStack() as stack:
+        if folder == usual:
+            stack.callback(_remove_empty, folder)
         page = _page(path, world)
         stack.callback(page.close)
         floor, mcus, imus = Floor(world), Mcus(), Mcus()
@@ -58,6 +60,11 @@ def run(file: Path, folder: Path | None = None, *, trace: Path | None = None, co
             threading.Thread(target=_run_commands, args=(mcus, end), name="pebble-world control", daemon=True).start()
         _publish_poses(page, mcus, end)
     return 0
+
+
+def _remove_empty(folder: Path) -> None:
+    with suppress(OSError):  # another world runs there, or its traces are in it
+        folder.rmdir()
 
 
 def port_path(folder: Path, robot: str) -> Path:

@@ -6,6 +6,7 @@ import ctypes
 import hashlib
 import json
 import math
+import os
 import shutil
 import signal
 import subprocess
@@ -257,6 +258,16 @@ def tracks(room: Path) -> dict[str, Track]:
 
 def poses(room: Path) -> dict[str, RobotPose]:
     return {name: track.newest.pose for name, track in tracks(room).items()}
+
+
+def test_the_usual_folder_of_a_world_ends_with_it(room: Path) -> None:
+    usual = room.parent / f"pebble-world-{room.stem}"
+    world = [sys.executable, "-m", "pebble.cli", "sim", "world", str(room)]
+    with Child(world, env=os.environ | {"TMPDIR": str(room.parent)}) as child:
+        assert until(lambda: port_path(usual, "fred").exists())
+        child.terminate()
+        child.wait(WAIT_S)
+    assert not usual.exists()
 
 
 def test_a_world_is_driven_controlled_and_ended_by_its_standard_input(room: Path) -> None:
