@@ -227,7 +227,7 @@ class Robots:
             return
         if not message.payload:  # a removal, of which the robot's view has to learn as well: see _interpret
             self._remove_value(component, metric)
-        trimmed = codec.trim(message.payload)  # pages get it unchanged, inside a JSON message
+        trimmed = codec.trim(message.payload)  # without what may not be in a JSON message to pages
         if trimmed != message.payload:
             message = msgspec.structs.replace(message, payload=trimmed)
         if message.payload and not self._store(component, metric, channel, message, now):
