@@ -156,7 +156,9 @@ def forked(work: Callable[[], object], seconds: float | None = None) -> bool:
     ctypes.CDLL(None).prctl(36, 1)  # PR_SET_CHILD_SUBREAPER: a process whose parent ends becomes a child of this one
     others = set(children())
     try:
-        pid = os.fork() or run_and_exit(work)  # it is 0 in the child, which never returns from there
+        pid = os.fork()
+        if pid == 0:  # the child
+            run_and_exit(work)  # never returns
         descriptor = os.pidfd_open(pid)
         ended, _, _ = select.select([descriptor], [], [], seconds)
         os.close(descriptor)

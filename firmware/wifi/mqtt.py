@@ -139,7 +139,7 @@ class Client:
             return False
         self._more.append(bytes((first, length)) if length < 128 else bytes((first, length & 127 | 128, length >> 7)))
         self._more.extend(parts)
-        self.sent(0)
+        self.sent(0)  # nothing was sent: this only fills ``out``
         return True
 
     def subscribe(self, count: int) -> None:

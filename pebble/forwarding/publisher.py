@@ -64,12 +64,12 @@ class Publisher:
     def is_echo(self, source: SideState, subject: Subject, message: Message) -> bool:
         """True if ``message`` is ours, and came back by another bridge or from a broker without bridge mode.
 
-        Forgets it and all earlier messages of its topic.
+        Forgets it and all earlier messages of its topic. A retained echo is recognised elsewhere, by its value.
         """
         topic, payload = message.topic, message.payload
         if (source.side, topic) in self._cycles.closed_ways and source.returns.is_echo(topic, payload):
             return True
-        # The side's own broker may have sent it back. A retained echo is recognised elsewhere, by its value.
+        # Or it is from the side's own broker, which sends back only what is two-way, and with `exact_echo` nothing.
         if source.transport.exact_echo or message.retain or not subject.is_two_way:
             return False
         return source.loopback.is_echo(topic, payload)

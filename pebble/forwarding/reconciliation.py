@@ -170,11 +170,11 @@ class Reconciliation:
         if side is self._winner:
             self._overtaken.clear()  # the winner's values have come; for those that come late there is _newer
             for topic, payload in self._held.items():
-                self._set(topic, payload, side.other)
+                self._set(topic, payload, side.other)  # it is the loser's value
                 due.append((side, topic, payload))  # to the winner, which has none
             self._held.clear()
         released = {topic for _, topic, _ in due}
-        due += [
+        due += [  # and all other newest values that ``side`` lacks
             (side, topic, last.payload)
             for topic, last in self._last.items()
             if topic not in released and self._is_missing(side, topic, last)

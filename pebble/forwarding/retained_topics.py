@@ -54,7 +54,7 @@ class RetainedTopics:
                 self._publish(source.side.other, subject, message, forward)
                 return forward
             if gate is Gate.WAITING and source.side is Side.LOCAL:  # the remote side is subscribed to once it is open
-                if message.topic in self._waiting or len(self._waiting) < _MAX_WAITING:  # others are dropped
+                if message.topic in self._waiting or len(self._waiting) < _MAX_WAITING:  # else it is lost
                     self._waiting[message.topic] = subject, message, forward
                 return Drop.HELD
             return Drop.CLOSED

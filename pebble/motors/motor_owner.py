@@ -292,7 +292,7 @@ class MotorOwner(Service, ABC):
         self._estop_note.report("estop", self.announced_latching)
 
     def _announce_latching(self) -> None:
-        if self.announced_latching:  # set by the caller: this is what is to be announced
+        if self.announced_latching:  # the caller has just set it: True is to be announced
             self.log.warning("the subscriptions to the emergency stop are granted again: a stop latches")
             self.repeat_state()
             return

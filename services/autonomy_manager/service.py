@@ -238,7 +238,7 @@ class AutonomyManager(Service):
             self._local.release()
             raise
         self._signs, self._unsigned_moves = plan.main.script.ours, False
-        for number in self._owners.steps_to(run):  # zeros of numbers in between: else an owner may think it older
+        for number in self._owners.steps_to(run):  # a zero of each: else an owner may take ``run`` for older
             self.halt(number)
         return run, self._owners.baseline()
 

@@ -219,7 +219,7 @@ class MqttBridge(ForwardingService):
 
     def connected(self, side: Side, epoch: int) -> None:  # see ForwardingService
         if side is Side.REMOTE:
-            if self.forwarder.gate is Gate.SHUT:  # else subscribe_remote() does that, which follows the check
+            if self.forwarder.gate is Gate.SHUT:  # else subscribe_remote() does that, below or after the check
                 self._publish_heartbeat(at_once=True)
         else:
             barrier(self.transport, self._same_broker.topic)  # until the robot's retained messages have arrived
@@ -269,14 +269,14 @@ class MqttBridge(ForwardingService):
         if self._same_broker.proves_two_brokers(round_):
             self._begin_forwarding()
 
-    def _begin_forwarding(self) -> None:
+    def _begin_forwarding(self) -> None:  # does nothing if it forwards already
         if self.remote.state is not State.CONNECTED or self.forwarder.gate is Gate.OPEN:
             return
         was_shut = self.forwarder.gate is Gate.SHUT
         self.forwarder.open()
         if was_shut:  # what was received meanwhile was dropped: a new subscription brings the retained messages again
             self.unsubscribe(Side.LOCAL)
-            self.forwarder.sides[Side.LOCAL].subscribing()
+            self.forwarder.sides[Side.LOCAL].subscribing()  # as at a new connection
             self.subscribe_local()
             self.forwarder.subscribed(Side.LOCAL)
         self.subscribe_remote()  # only now; the local side was subscribed to while the gate was WAITING
@@ -421,7 +421,7 @@ class MqttBridge(ForwardingService):
             self.refusals.stale("a command" if channel is None else channel.metric)
             return
         if isinstance(routed.outcome, Drop) and (routed.outcome in _IGNORED or not is_local):
-            return  # of dropped messages only the robot's own may be requests, unless dropped for these reasons
+            return  # a dropped message is a request only if it is the robot's own, and not dropped for one of _IGNORED
         if channel is None or codec.is_blank(message.payload):
             return
         if not message.retain and routed.outcome is not Drop.KNOWN:  # KNOWN: nothing new for observers

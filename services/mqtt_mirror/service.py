@@ -79,9 +79,9 @@ class MqttMirror(ForwardingService):
             return
         if epoch != self.epoch:  # that connection is lost already
             return
-        if not self.remote.exact_echo:  # subscribe(echo=False) does not keep our own messages away
+        if not self.remote.exact_echo:  # its own messages come back in spite of echo=False
             self._refuse('sends our own messages back; use one with bridge mode (mosquitto), or protocol "5"')
-        elif self.forwarder.gate is Gate.OPEN:  # the broker was checked; a probe shows if it is another now
+        elif self.forwarder.gate is Gate.OPEN:  # its broker was checked before; a probe shows if it is another now
             self.subscribe_remote()
             self._request_probe()
         else:

@@ -162,7 +162,7 @@ class Dialler:
         if late:
             self.addresses.was_slow()
         if self.loses_large or not (silent or late):
-            return False  # they are small already, or it tells nothing of large ones: no silence, no late TLS
+            return False  # segments are small already, or this end tells nothing of large packets
         self._large_lost = self._large_lost + 1 if self._may_have_lost_large(lost) else 0
         return self.loses_large
 

@@ -131,7 +131,7 @@ class Incoming:
         if now - waiting.checked_at > OVERSLEPT_S and self.accepted is not None:  # no pings before the CONNACK
             self.pings.send_after_stall(client, now)
         size = client.receive()
-        waiting.found(size if client.drained else size + readable_bytes(client.socket), now)  # with bytes not read yet
+        waiting.found(size if client.drained else size + readable_bytes(client.socket), now)  # and what is left there
         return size
 
     @property

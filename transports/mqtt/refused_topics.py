@@ -51,7 +51,7 @@ class RefusedTopics:
         self._trial: Trial | None = None
         self._quiet_at = -inf  # a trial begins after this time, which is QUIET_S after the newest loss
         #: Topics that were logged as refused, withheld or not: why, and when that was last in the log.
-        self.not_taken = BoundedTable[tuple[str, float]](TOPICS, TOPICS * MAX_BYTES, lambda _: 0)  # 0: topics count
+        self.not_taken = BoundedTable[tuple[str, float]](TOPICS, TOPICS * MAX_BYTES, lambda _: 0)  # only topics count
 
     def accepts(self, message: Message) -> bool:
         """True if ``message`` may be sent: its topic is not withheld, or is on trial."""

@@ -188,7 +188,7 @@ class MqttTransport(Transport):
     # -- the network thread
 
     def _run(self, run: _Run) -> None:
-        failures, stopping = 0, run.stopping  # failures in a row before this one: after the first there is no pause
+        failures, stopping = 0, run.stopping  # failures in a row without the newest: there is no pause after the first
         while not stopping.is_set():
             began, problem = time.monotonic(), "failed unexpectedly"
             try:
@@ -212,7 +212,7 @@ class MqttTransport(Transport):
             if self._dialler.addresses.several and not self._dialler.addresses.is_over:
                 continue  # the next address
             pause = min(self.settings.reconnect_max_s, _RETRY_S * 2 ** (failures - 1)) if failures else 0.0
-            if not self._dialler.limits.asks_again:  # else it is asked in another way now: that is no failure yet
+            if not self._dialler.limits.asks_again:  # else it is asked in another way at once: no failure yet
                 failures = min(failures + 1, 20)  # bounded, because it is an exponent
             stopping.wait(pause * random.uniform(0.5, 1.0))  # noqa: S311  (jitter, no secret)
 

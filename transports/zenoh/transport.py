@@ -307,7 +307,7 @@ class ZenohTransport(Transport):
             with contextlib.suppress(zenoh.ZError):  # closed meanwhile
                 subscriber.undeclare()  # type: ignore[no-untyped-call]
 
-    def _make_subscriber(self, session: zenoh.Session, subscription: Subscription) -> None:
+    def _make_subscriber(self, session: zenoh.Session, subscription: Subscription) -> None:  # unless it has one
         if subscription in self._subscribers:
             return
         origin = zenoh.Locality.ANY if subscription.echo else zenoh.Locality.REMOTE
@@ -319,14 +319,14 @@ class ZenohTransport(Transport):
             self.count_received()
             read_at = clock.since_boot()
             stamp = wire.read_live(sample.attachment)
-            # A sender of this boot shares our clock: the age is known. Only if it is high, or unknown, ask `_is_late`.
+            # since: when it was sent; None if its sender does not share our clock. If long ago or None, ask `_is_late`.
             since = stamp.sent_ns / 1e9 if stamp.boot == wire.BOOT else None
             if (since is None or read_at - since > late_s) and self._is_late(sample, stamp, read_at):
                 return
             topic, payload = only_topic or key_to_topic(str(sample.key_expr)), sample.payload.to_bytes()
             qos = min(stamp.qos, subscription.qos)
             message = Message(topic, payload, qos, False, stamp.retain_requested, read_at if since is None else since)
-            if may_be_ours and publishers.thread == threading.get_ident():  # see LoopbackQueue
+            if may_be_ours and publishers.thread == threading.get_ident():  # this thread is inside put()
                 self._loopback.put(subscription, message)
             else:
                 subscription.offer(message)

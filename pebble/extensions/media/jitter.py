@@ -257,13 +257,13 @@ class JitterBuffer:
         last = self._last
         if last is None:
             return None
-        allowed = round(self._budget_s * last.rate)
+        budget = round(self._budget_s * last.rate)  # samples, at whose end the sound has faded away
         remaining = round(min(gap_s, self._budget_s) * last.rate) - self._concealed
         size = min(remaining, round(_PIECE_S * last.rate))
         if size <= 0:
             return None
         estimate = self._estimated(last, size)
-        gain = 1.0 - (self._concealed + np.arange(len(estimate))) / allowed
+        gain = 1.0 - (self._concealed + np.arange(len(estimate))) / budget
         self._concealed += len(estimate)
         self.counters.add("concealed_ms", round(1000 * len(estimate) / last.rate))
         return Chunk(to_int16(estimate * gain[:, None]), last.rate, last.channels, concealed=True)

@@ -227,7 +227,7 @@ class Robots:
             return
         if not message.payload:  # a removal, of which the robot's view has to learn as well: see _interpret
             self._remove_value(component, metric)
-        trimmed = codec.trim(message.payload)  # pages get it unchanged, inside a JSON message
+        trimmed = codec.trim(message.payload)  # without what may not be in a JSON message to pages
         if trimmed != message.payload:
             message = msgspec.structs.replace(message, payload=trimmed)
         if message.payload and not self._store(component, metric, channel, message, now):
@@ -334,14 +334,14 @@ class Robots:
     def _interpret(self, component: Component, metric: str, channel: c.Channel, message: Message, now: float) -> None:
         """Update the view of the robot from a message that arrived at ``now``."""
         robot, capabilities_before = component.robot, component.robot.capabilities
-        received_at = time.time() - (time.monotonic() - now)
-        robot.receive(channel, message, now, received_at)
+        wall = time.time() - (time.monotonic() - now)  # the epoch time at ``now``, which is monotonic
+        robot.receive(channel, message, now, wall)
         if channel is c.MCU_DESCRIBE and message.payload:
             component.aliases[metric] = _aliases(message.payload)
         if robot.capabilities is not capabilities_before and "announced" in robot.capabilities:
             self.show_announced(component, now)
         if robot.liveness.reported_offline and component.sent_online is not False:
-            self._refresh(component, now)  # it may be back before the next round
+            self._refresh(component, now)  # at once: it may be back before the next `refresh`
 
     def show_announced(self, component: Component, now: float) -> None:
         """Send pages the capabilities that a component announces, or is assumed to have, until it publishes its own."""

@@ -131,6 +131,7 @@ class Query:
 def check_names(query: Query, paths: Iterable[Path], places: Iterable[Path]) -> None:
     """Raise RecordingError if no recording of ``places`` has the robot or topic of the query: it may be mistyped.
 
+    ``paths`` are the files there; the error names ``places``, as the user has named them.
     If a file cannot be read completely, its names are unknown; then nothing is raised, since the file's problem is
     reported.
     """
@@ -146,7 +147,8 @@ def check_names(query: Query, paths: Iterable[Path], places: Iterable[Path]) -> 
         except RecordingError:
             return
     robots = robots_of(channels)
-    if query.robot not in [*map(composed, robots)]:  # check_name lets None pass
+    typed_robots = [composed(robot) for robot in robots]  # as a keyboard writes them; recorded ones may differ
+    if query.robot not in typed_robots:  # check_name knows the recorded ones, and lets None pass
         check_name("robot", query.robot, robots, places)
     topics = {channel.topic for channel in channels if query.robot is None or is_of(channel.topic, query.robot)}
     for filter_ in query.topics:

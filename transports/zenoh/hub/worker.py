@@ -139,7 +139,7 @@ class HubWorker:
         if "*" not in text:
             retained = self._store.get(text.removeprefix(wire.RETAINED))
             return [] if retained is None else [retained]
-        begin = text.partition("*")[0].rstrip("$/")  # a quick choice; no $ of "$*", and no /: "a/**" matches "a"
+        begin = text.partition("*")[0].rstrip("$/")  # of all matches: no $ of "$*"; no /, as "a/**" matches "a"
         keyed = ((wire.RETAINED + retained.key, retained) for retained in self._store.retained())
         return [retained for key, retained in keyed if key.startswith(begin) and wanted.intersects(key)]
 

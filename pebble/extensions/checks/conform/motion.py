@@ -232,8 +232,8 @@ def _reset_waits(robot: Observer, driver: Driver) -> CheckResult:
     why = "a stick that is held down moves it after a reset"
     outcome = _not_moved(robot, began, why, "wait for a zero of who has control, or for 0.5 s without commands")
     if outcome.state is State.OK:
-        driver.send()  # the zero that counts as a release: now it must move
-        outcome = _rest(robot, *driver.drive(), RESTS_S)  # fails, too, if it did not move before
+        driver.send()  # the zero that counts as a release
+        outcome = _rest(robot, *driver.drive(), RESTS_S)  # now it must move, and rest afterwards
     is_free = robot.wait(lambda: not robot.view.latched, ANSWER_S)
     return outcome if is_free else failed("a reset does not end the stop", END_IT)
 

@@ -175,6 +175,7 @@ class CarriedRobot:
                 self.forwarder.retained.synchronize(side)
         if now >= self._probe_at:
             self._probe_at = now + PROBE_PERIOD_S
+            # REMOTE: only from there commands pass (see GATEWAY).
             self.forwarder.publisher.probe_again((Side.REMOTE,), self.forwarder.retained.value)
 
     # -- the transports' threads

@@ -83,7 +83,8 @@ class RecordingFile:
         self.statistics: Statistics | None = None  # None: the file is not finished, or its summary is incomplete
         self._schemas: dict[int, Schema] = {}
         self._metadata: list[int] = []  # positions of the records of metadata
-        self._scan = Scan(self._read, self.damage)
+        self._scan = Scan(self._read, self.damage)  # of all records, for a file without a usable summary
+        #: Returns a chunk's messages of all channels; the newest few chunks stay in memory.
         self._recent = lru_cache(_KEPT)(partial(self._unpacked, chooses=lambda _channel: True))
         try:
             self._file = open_plain(path)
