@@ -109,7 +109,7 @@ class Subjects(dict[str, Subject | None]):
             self._addresses = [Addresses(view_of(config, instance)) for instance in instances]
         self._between_robots = tuple(f"{self._base}/{family}" for family in BETWEEN_ROBOTS)
         self._incoming = f"{self._base}/{INCOMING}/".encode()
-        topics = (topic.encode() for topic in self.topics(*CHANNELS))  # those elsewhere keep their base: no metrics
+        topics = (topic.encode() for topic in self.topics(*CHANNELS))  # one elsewhere stays whole below: no metric
         self._known_metrics = frozenset(topic.removeprefix(self._incoming) for topic in topics)
 
     def __missing__(self, topic: str) -> Subject | None:
