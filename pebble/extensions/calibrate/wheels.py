@@ -98,7 +98,8 @@ class _Session:
             camera = CameraModel.find([robot.config.folder])
             self._legs.watch(TagFinder(wanted.tag_size_m, camera, wanted.family), wanted.tag)
         kinds = [self._straight] * wanted.straights + [self._spin] * wanted.spins
-        #: The method of each run, and its sign, in turns: 1 (there, or left), -1 (back, or right). Straights are even.
+        #: The method of each run, and its sign, by turns 1 (there, or left) and -1 (back, or right). The number of
+        #: straights is even, see :func:`check`, so the spins begin to the left.
         self._drives = [(drive, 1 if number % 2 == 0 else -1) for number, drive in enumerate(kinds)]
         self.runs: list[Run] = []
 
