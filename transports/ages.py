@@ -86,7 +86,7 @@ class SenderClocks(Generic[K]):
                 clock = self._clock_to_use(key, clock, sent, now, late_s)
             if waited_s <= late_s:
                 clock.proved = max(clock.proved, now - sent - waited_s)
-            # The difference without delay is between `proved` and `least`. The smaller errs towards a longer age.
+            # Without delay the difference is at least `proved`, at most `least`. The smaller errs towards a longer age.
             age = now - sent - min(clock.least, clock.proved)
             return age if now - clock.began >= _YOUNG_S else max(age, waited_s)
 

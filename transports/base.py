@@ -387,7 +387,7 @@ class Transport(ABC):
                 self._count_sent()
             else:  # "parked" is the published name of the counter of pending messages
                 self.counters.add("parked" if stored else "refused")
-            return accepted or stored
+            return accepted or stored  # stored by `remember`: it is sent once the connection is back
 
     def subscribe(
         self,

@@ -159,7 +159,7 @@ def _config(
     file_class, config_class, rules = _classes(installed)
     reader = Reader(folder, env, rules, notes, file=path, other_forms=True)
     merged = with_instances(written)
-    ignored_keys = extensions.keys_of_missing(installed)  # of ours that are not in ``installed``: no class has them
+    ignored_keys = extensions.keys_of_missing(installed)  # of our other extensions: file_class lacks these keys
     if core_only:
         ignored_keys += [key for extension in available for key in extension.sections]
     root = reader.section(file_class, without(merged, ignored_keys))
@@ -167,7 +167,7 @@ def _config(
     if path is not None and holds_secret(written):
         warn_if_readable(notes, (), path, "it, and there is a password in it")
     if notes.problems:
-        # Missing extensions come first, even those that are only warnings: unknown sections may be theirs. Each once.
+        # Missing extensions first, even those that are only warnings: unknown sections may be theirs. None comes twice.
         raise ConfigError(list(dict.fromkeys(map(str, (*about_missing, *notes.problems)))))
     identity = Identity(root.robot.system, root.robot.type, root.robot.id)
     config: Config = config_class(

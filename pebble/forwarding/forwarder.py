@@ -119,15 +119,15 @@ class Forwarder:
         )
         #: Results of :func:`route` by its arguments, see _route. There are few subjects, so no bound is needed.
         self._routes: dict[tuple[Side, Subject, QoS, bool, bool | None, bool], Forward | Drop] = {}
-        self._admission = Admission(clock)
-        self.ages = CommandAges()
-        self.cycles = Cycles(clock)
+        self._admission = Admission(clock)  # limits of size and number
+        self.ages = CommandAges()  # of commands, by the clocks of their senders
+        self.cycles = Cycles(clock)  # messages that something else brings back
         both_ways = frozenset(kind for kind in Kind if rules.both_ways(kind))
         self.publisher = Publisher(self.sides, self.cycles, subjects, self.counters, both_ways, stored=rules.stored)
         self.retained = RetainedTopics(self.sides, subjects, self.publisher, winner, both_ways, on_value)
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
         self.mirroring = Mirroring(self.sides)
-        #: Publishes a message that is admitted, at once; an extension may put in its place what lets some wait.
+        #: Publishes an admitted message at once; an extension may replace it by a function that lets some of them wait.
         self.pass_on: Pass = self.pass_now
         #: Is told whether each drive command, and request for control, from outside was late.
         self.note_age: Callable[[bool], None] = lambda _late: None
@@ -178,10 +178,10 @@ class Forwarder:
     # -- the receiving threads
 
     def skips_retained(self, side: Side, topic: bytes) -> bool:
-        """True if retained messages of ``topic`` do not pass: then counts and logs the present one. For TopicPolicy."""
+        """True if a retained message of ``topic`` does not pass: then it is counted and logged. For TopicPolicy."""
         if self._names is not None and topic.endswith(_STOP) and self._is_stop(topic.decode(errors="replace")):
             return False  # it may be a live stop, with a name in its topic
-        kind = self.subjects.invented(topic)  # a flag or a command that the contract does not know
+        kind = self.subjects.invented(topic)  # FLAG or COMMAND if the contract does not know the topic; else None
         if kind is None or (kind is Kind.FLAG and not self._admission.refuses_flag(topic)):
             return False  # the contract knows it, or it is an unknown flag for which there is room
         drop = Drop.TOO_MANY if kind is Kind.FLAG else Drop.STALE  # a retained command

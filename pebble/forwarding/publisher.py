@@ -33,9 +33,9 @@ class Publisher:
 
     def publish(self, to: SideState, subject: Subject, message: Message, forward: Forward) -> None:
         topic, payload, transport = message.topic, message.payload, to.transport
-        if subject.runs or self._cycles.closed_ways:  # it must run only once, or some topic circulates
+        if subject.runs or self._cycles.closed_ways:  # what it starts must run only once, or some topic circulates
             self.note_return(to, subject, message)
-        echoing = not transport.exact_echo and subject.is_two_way
+        echoing = not transport.exact_echo and subject.is_two_way  # its own broker may send it back
         if echoing:
             to.loopback.expect(topic, payload)
         accepted = transport.publish(

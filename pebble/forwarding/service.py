@@ -159,7 +159,7 @@ class ForwardingService(Service, ABC):
                 self.call_at(self.clock() + QUIET_S, synchronize)  # some brokers send them late
             elif side is Side.LOCAL or epoch == self.epoch:  # the remote side has not been lost meanwhile
                 self.forwarder.retained.synchronize(side)
-                # Not earlier: by now a mirror at a wrong broker has stopped. Once LOCAL is back only a bridge probes.
+                # Not before: a mirror at a wrong broker has stopped by now. After a loss of LOCAL only bridges probe.
                 if side is Side.REMOTE or self.rules.leaves_robot:  # leaves_robot: this is the bridge
                     self.forwarder.publisher.probe_commands(*self.probed_sides)
 

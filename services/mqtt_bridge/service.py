@@ -310,7 +310,7 @@ class MqttBridge(ForwardingService):
         forwards = gate is Gate.OPEN and bool(self.subscriptions[Side.REMOTE])
         passes = self._same_broker.both_connected and (needs_no_bridge or forwards)
         late, refused = counters[f"{Side.REMOTE.value}: {Drop.LATE.value}"], counters[f"{Side.LOCAL.value}: refused"]
-        # Any change of these may mean that a message was lost.
+        # Any change of these may mean a loss on the way in: late from the remote side, or refused by the local one.
         losses = gate, self.epoch, self._local_changes, refused, late, self.transport.counters["dropped"]
         self.publish(c.CONTROL_VOUCHED, self._vouching.check(passes, losses, self.clock()))
 

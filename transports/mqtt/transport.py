@@ -245,7 +245,7 @@ class MqttTransport(Transport):
             self._keep_unconfirmed(connection)
 
     def _serve(self, connection: Connection, run: _Run) -> None:
-        tried_at = time.monotonic() + _TRIED_S  # only a connection that lasts so long shows the limits
+        tried_at = time.monotonic() + _TRIED_S  # a connection that ends sooner does not prove the broker's limits
         try:
             self._synchronize(connection, run.stopping)
             if earlier_failures := self._dialler.addresses.succeeded():
@@ -255,11 +255,11 @@ class MqttTransport(Transport):
                 if run.renewal:  # see renew_connection
                     connection.disconnect()
                     raise Lost(run.renewal)
-                if connection.limits is not self._dialler.reported and time.monotonic() > tried_at:
+                if connection.limits is not self._dialler.reported and time.monotonic() > tried_at:  # not logged yet
                     self._report_limits(connection)
-                if self._own.pending and connection.has_room:
+                if self._own.pending and connection.has_room:  # retained messages that were not sent yet
                     self._sync_retained(self._own.keys())
-                if self._refused.withheld:
+                if self._refused.withheld:  # topics that are not sent, as the broker hangs up on them
                     self._try_withheld(connection)
         except Lost as lost:
             self._note_loss(connection, lost)
@@ -316,14 +316,14 @@ class MqttTransport(Transport):
         with self._publishing:
             messages = {topic: message for topic, message in self._own.items() if topic not in self._own.pending}
             not_accepted = {topic for topic, message in messages.items() if not self._accepts(connection, message)}
-            may_differ = self._own.shared | not_accepted  # there it may: others publish, too, or ours is refused
+            may_differ = self._own.shared | not_accepted  # others publish there, too, or the broker refuses ours
         retained = self._find(connection, list(messages), stopping)
         if self.will is not None and retained.get(self.will.topic) == self.will.payload:
             del retained[self.will.topic]  # our own will, published although we were running
         differing = {topic for topic, payload in retained.items() if payload != messages[topic].payload}
         older = differing - may_differ
         self.went_back = bool(older)
-        return retained.keys() - older  # an older one is replaced by ours
+        return retained.keys() - older  # without older ones, as ours replace them
 
     def _find(self, connection: Connection, topics: list[str], stopping: threading.Event) -> dict[str, bytes]:
         """Return the payloads that the broker retains on these topics."""

@@ -61,7 +61,8 @@ _COMMANDS: dict[str, Callable[[Any], Row]] = {
     LIGHTS_FLASH.suffix: lambda colour: _lights_row(colour),
     OUTLET_COMMAND.suffix: lambda request: {"what": "outlet", "on": request.on},
 }
-_MILD = (SOUNDBOARD_COMMAND, LIGHTS_SOLID, LIGHTS_FLASH)  # their rows take no room that others need
+#: Harmless commands: after OF_STRANGERS different rows in a minute theirs are only counted, so that others have room.
+_MILD = (SOUNDBOARD_COMMAND, LIGHTS_SOLID, LIGHTS_FLASH)
 
 
 def files(config: Config) -> list[Path]:

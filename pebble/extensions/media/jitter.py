@@ -198,7 +198,7 @@ class JitterBuffer:
     def _next(self, now: float) -> Chunk | None:
         """Return the next packet's sound, or estimated sound for a gap before it; None if there is neither."""
         if not self._waiting:
-            if self._last is not None and not self._concealed:
+            if self._last is not None and not self._concealed:  # once: later calls have concealed something
                 self.counters.add("underruns")
             return self._conceal(self._budget_s)
         number = self._first()

@@ -82,8 +82,8 @@ class Interest:
     """A page's subscription: the values that it still needs, and the component that it has open."""
 
     def __init__(self, changed: Callable[[], None]) -> None:
-        self.watched = ""
-        self.dirty: set[tuple[str, str]] = set()
+        self.watched = ""  # the component that it has open; "": none
+        self.dirty: set[tuple[str, str]] = set()  # component and metric of each value that it still needs
         self.more = False  # what is dirty did not fit into the last message
         self.gone: set[str] = set()  # components that were removed since the last message
         self.notify = changed
@@ -100,7 +100,7 @@ class Robots:
         self.is_kept: Callable[[str], bool] = lambda _ref: False
         self.names: Mapping[str, str] = {}  # of components that may have none of their own
         self.omitted = 0  # messages of components, metrics and values beyond the limits
-        self.interests: set[Interest] = set()
+        self.interests: set[Interest] = set()  # of the connected pages
         #: Called with a component whose retained messages are not known here (any more).
         self.on_forget: Callable[[str], object] = lambda _: None
         self.logs: dict[str, LogLines] = {}  # of watched components

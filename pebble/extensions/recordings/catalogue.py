@@ -147,8 +147,8 @@ def check_names(query: Query, paths: Iterable[Path], places: Iterable[Path]) -> 
         except RecordingError:
             return
     robots = robots_of(channels)
-    typed_robots = [composed(robot) for robot in robots]  # as a keyboard writes them; recorded ones may differ
-    if query.robot not in typed_robots:  # check_name knows the recorded ones, and lets None pass
+    names_as_typed = [composed(robot) for robot in robots]
+    if query.robot is not None and query.robot not in names_as_typed:
         check_name("robot", query.robot, robots, places)
     topics = {channel.topic for channel in channels if query.robot is None or is_of(channel.topic, query.robot)}
     for filter_ in query.topics:

@@ -89,7 +89,9 @@ class LocalOnly(PrivateTopics):
         if message.topic.startswith(self._before_values):
             uid = message.topic.removeprefix(self._before_values).partition("/")[0]
             return None if message.topic.endswith(_DESCRIBE) else uid
-        sample = _object(message.payload) if _MARK in message.payload else {}  # of an alias: the uid is inside
+        if _MARK not in message.payload:
+            return None
+        sample = _object(message.payload)  # a value under an alias: its topic has no uid, its payload has
         sender = sample.get("device_uid")
         return sender if isinstance(sender, str) and isinstance(sample.get("interface"), str) else None
 

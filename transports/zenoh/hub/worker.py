@@ -123,9 +123,9 @@ class HubWorker:
         try:
             needs = wire.decode_counts(_payload(query))
         except (ValueError, msgspec.DecodeError):
-            query.drop()  # type: ignore[no-untyped-call]
+            query.drop()  # type: ignore[no-untyped-call]  # it ends without an answer
             raise
-        if not self._waiting.add(needs, query, time.monotonic()):
+        if not self._waiting.add(needs, query, time.monotonic()):  # it need not wait, or finds no room
             self._answer(query)
 
     def _answer(self, query: zenoh.Query) -> None:

@@ -122,8 +122,8 @@ def refusals(trial: BrokerTrial) -> CheckResult:
     writer.publish("x")
     if trial.wait(lambda: reader.received, 1.0):
         return skipped("this account is refused none")
-    may_publish = _is_forbidden(trial) is False  # not None: the broker has accepted a message there
-    if may_publish:
+    is_forbidden = _is_forbidden(trial)  # None: not known
+    if is_forbidden is False:  # the broker has accepted a message there
         return warn("it grants them, and then delivers nothing")
     return skipped("it grants them, and nothing comes: this account may not publish there, or may not read")
 

@@ -298,15 +298,15 @@ def _confirmed(_robot: Observer, _name: str) -> CheckResult:
 
 def _after_long_ones(robot: Observer) -> CheckResult:
     """Check that a stop still reaches the robot after messages that are too long for small boards."""
-    stops_it = while_stopped(_confirmed)
-    if stops_it(robot).state is not State.OK:  # OK: it has read all that was sent before
+    try_stop = while_stopped(_confirmed)  # a check: a stop is confirmed, and ends by its reset
+    if try_stop(robot).state is not State.OK:  # OK: it has read all that was sent before
         return skipped("no stop reaches it without them, either")
     for _ in range(_BURSTS):
         for _ in range(_LONGS):
             robot.send(c.CONTROL, _LONG)
         robot.sent(ANSWER_S)
         robot.look(ANSWER_S)
-    if stops_it(robot).state is State.OK:
+    if try_stop(robot).state is State.OK:
         return ok("a stop reaches it after them")
     return failed(
         f"after {_BURSTS * _LONGS} messages of {len(_LONG)} bytes no stop reaches it, until it connects again",

@@ -117,7 +117,7 @@ def at_the_wheel(robot: Observer, by: str = BY, answer_s: float = ANSWER_S) -> I
     """
     driver = Driver(robot, by)
     try:
-        if robot.view.controlled:
+        if robot.view.controlled:  # it decides itself who drives it
             driver.asks(for_ms=10_000)
             robot.answers(lambda: driver.holds, answer_s)
         if driver.may_drive:

@@ -86,7 +86,7 @@ class FrameWriter:
         self._retry_at = _NEVER
         if self.problem:
             log.warning("%s", self.problem)
-            if not self._has_room():
+            if not self._has_room():  # which may change: see may_share
                 self._retry_at = time.monotonic() + RETRY_S
         small = self._declare_publisher(session, _DROP)  # for sound, and for references to shared memory
         # For pictures that are sent as bytes; a writer of sound has none.

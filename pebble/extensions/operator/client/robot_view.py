@@ -331,7 +331,8 @@ class RobotView:
             online=self.online(now),
             latched=self.latched,
             free_s=now - self.reset_at,
-            published=bool(self.capabilities) or self.estop.has_capabilities,  # also assumed; its own even if empty
+            # Capabilities that are assumed for it count, and its own even if they are empty.
+            published=bool(self.capabilities) or self.estop.has_capabilities,
             drives=self.drives,
             arbitrates=self.arbitrates,
             script=bool(self.script),

@@ -352,9 +352,9 @@ class DrivenRobot:
     def _has_ended(self, wish: Wish, now: float) -> bool:
         """True if the page wants no control any more, and the robot confirms that or has not answered in time."""
         if not wish.client.done:
-            wish.ended_at = float("inf")  # it may have asked again
+            wish.ended_at = float("inf")  # not ended: it may have asked again, or its release is not sent yet
             return False
-        wish.ended_at = min(wish.ended_at, now)
+        wish.ended_at = min(wish.ended_at, now)  # the first time that this was seen
         state = self.published
         return state is None or state.id != wish.client.id or now - wish.ended_at > self.pace.answer_s
 

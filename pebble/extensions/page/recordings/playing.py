@@ -137,7 +137,8 @@ class PlayedRobot:
         self.sent = self.skipped = 0  # an output has them; nothing is counted here
         self.moves = False  # a shown recording moves nothing
         self._newest_ns = at_ns  # of what was sent
-        # _begin sets what starts again with each seek. The source calls it, the first time before any message.
+        # _begin sets what starts again with each seek, such as _picture, the newest at that time, and _pictured_at, the
+        # time of the last one that was shown. The source calls it, the first time before any message.
         self.player = Player(
             RobotSource(archive, ref, self._begin),
             lambda _channel: True,  # play all channels

@@ -62,10 +62,10 @@ class HostNetwork:
     def __init__(self, clock: Clock, *, platform: Platform = "esp32") -> None:
         self.clock = clock
         self.radio = Radio(clock.now, platform)
-        self.new_sockets: list[socket.socket] = []
+        self.new_sockets: list[socket.socket] = []  # this machine's, for TCP, until that program has taken them
         self.unread = False
         self.problem = ""  # of the last connection, as text
-        self.open: list[BoardSocket] = []
+        self.open: list[BoardSocket] = []  # all that the firmware has not closed
         self.servers = Servers()
 
     def modules(self) -> dict[str, Any]:
