@@ -342,7 +342,7 @@ def packages() -> Iterator[Extension]:
             yield extension
         except KeyboardInterrupt:
             raise
-        except BaseException as error:  # noqa: BLE001 - as in named()
+        except BaseException as error:  # noqa: BLE001 - a module of others may raise anything, also SystemExit
             log.error("the extension %s cannot be loaded: %s", name, _reason(error))
 
 

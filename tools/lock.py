@@ -27,9 +27,12 @@ NAME = re.compile(r"^[a-z0-9][a-z0-9._-]*(?===)", re.MULTILINE)
 
 
 def compiled(*words: str) -> str:
-    """Return the packages that uv chooses; ends the program if it cannot."""
+    """Return the packages that uv chooses for ``words``: its arguments, such as files of requirements and options.
+
+    The argument ``-`` stands for what builds the wheel. Ends the program if uv cannot choose.
+    """
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    builds = "\n".join(project["build-system"]["requires"])  # read where ``words`` has a dash
+    builds = "\n".join(project["build-system"]["requires"])  # uv's input, read for the argument "-"
     command = [sys.executable, "-m", "uv", "pip", "compile", "--no-config", "--quiet", "--universal"]
     command += ["--python-version", "3.11", "--no-header", "--no-annotate"]
     command += ["--no-emit-package", "colorama"]  # of packages that also run on Windows

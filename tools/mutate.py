@@ -156,7 +156,9 @@ def forked(work: Callable[[], object], seconds: float | None = None) -> bool:
     ctypes.CDLL(None).prctl(36, 1)  # PR_SET_CHILD_SUBREAPER: a process whose parent ends becomes a child of this one
     others = set(children())
     try:
-        pid = os.fork() or run_and_exit(work)  # it is 0 in the child, which never returns from there
+        pid = os.fork()
+        if pid == 0:  # the child
+            run_and_exit(work)  # never returns
         descriptor = os.pidfd_open(pid)
         ended, _, _ = select.select([descriptor], [], [], seconds)
         os.close(descriptor)
@@ -267,9 +269,9 @@ class Trial:
         seconds_of = {name: seconds for name, (seconds, _) in passed.items()}
         # rows of a module stay together, as they share what they set up
         names = sorted(passed, key=lambda name: (self.slowest[module_of[name]], seconds_of[name]))
-        self.rows = {name: passed[name] for name in names}
+        self.rows = {name: passed[name] for name in names}  # in the order of running; each: its seconds, and its arcs
         self.lines = {name: lines_of(arcs) for name, (_, arcs) in self.rows.items()}
-        self.failing = FAILED.findall(self.failed.read_text())
+        self.failing = FAILED.findall(self.failed.read_text())  # rows that fail without a mutant, too
         print(f"{len(names)} rows pass without a mutant; left out, as they fail: {', '.join(self.failing) or 'none'}")
         if not names:
             pytest.exit("no row passes without a mutant", 2)
@@ -277,7 +279,7 @@ class Trial:
             self.write_arcs()
 
     def write_arcs(self) -> None:
-        """Write which test functions cover each arc, for --spare."""
+        """Write which test functions cover each arc. By this --spare, in a later run, finds tests that may go."""
         covering: defaultdict[tuple[str, int, int], set[str]] = defaultdict(set)
         for name, (_, arcs) in self.rows.items():
             for arc in arcs:
@@ -354,11 +356,11 @@ class Trial:
         return len(self.run_rows(names, stop=not self.options.matrix)) == len(names)
 
     def run_new(self, file: str, text: bytes) -> None:
-        """Run all rows with a changed file in a new process, where pytest writes which fail."""
+        """Run all rows but ``failing`` with a changed file, in a new process where pytest writes which fail."""
         (self.tree / file).write_bytes(text)
         os.utime(self.tree / file, (0, 0))  # so that no .pyc file is taken for it
         os.dup2(os.open(self.failed, os.O_WRONLY), 1)
-        options = ["--tb=no", "-rfE", f"--maxfail={int(not self.options.matrix)}"]  # 0: no limit
+        options = ["--tb=no", "-rfE", f"--maxfail={int(not self.options.matrix)}"]  # 0: no limit, find all killers
         options += [f"--deselect={name}" for name in self.failing]
         os.execv(sys.executable, [sys.executable, "-m", "pytest", *options, *self.arguments])  # noqa: S606
 

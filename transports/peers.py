@@ -171,7 +171,7 @@ class PeerRegistry:
         return {name: owner for name, owner in self._running().items() if owner and name != but}
 
     def _running(self) -> dict[str, str]:
-        owners = {}
+        owners = {}  # by the name of a process that runs: its ``owner``, "" until it is ready
         with suppress(FileNotFoundError):  # nothing was ever opened there
             for name in os.listdir(self._run_dir):  # noqa: PTH208  (a glob takes 300 KB for its patterns)
                 path = self._run_dir / name

@@ -54,7 +54,7 @@ class Client:
         """
         data = self.data
         self._end += count
-        # Nothing is read while what is sent waits for room in ``out``. 6: an answer, and a ping.
+        # Nothing is read while ``_more``, which is to be sent, waits for room in ``out``. 6: an answer, and a ping.
         while not self._more and len(self.out) - self.waiting > 6:
             skipped = min(self._skip, self._end - self._at)
             self._skip -= skipped
@@ -74,7 +74,7 @@ class Client:
             if stop > self._end and self._end - start < len(data):  # incomplete, and there is room for more of it
                 return ""
             self._at = min(stop, self._end)
-            self._skip = stop - self._at  # of one that is too long
+            self._skip = stop - self._at  # the rest of a packet that is too long
             first = data[start]
             if first >> 4 == 3:
                 self._publication(first, at + 1, stop)
@@ -140,7 +140,7 @@ class Client:
             return False
         self._more.append(bytes((first, length)) if length < 128 else bytes((first, length & 127 | 128, length >> 7)))
         self._more.extend(parts)
-        self.sent(0)
+        self.sent(0)  # nothing was sent: this only fills ``out``
         return True
 
     def subscribe(self, count: int) -> None:

@@ -66,11 +66,11 @@ def _without_login(match: re.Match[str]) -> str:
         return word
     end = ats[-1]
     slashes = _SLASHES.search(word)
-    # The first colon with a password after it; the user name before it begins after a sign such as a quote.
+    # The first colon that does not end directly before the last @: what is between them is taken for the password.
     colon = next((colon for colon in _COLON.finditer(word, 0, end) if colon.end() < end), None)
     if slashes and slashes.end() <= end:  # SCHEME://LOGIN@
         start = slashes.end()
-    elif colon:  # NAME:PASSWORD@
+    elif colon:  # NAME:PASSWORD@; NAME begins after a sign such as a quote
         start = max((sign.end() for sign in _BEFORE_USER.finditer(word, 0, colon.start())), default=0)
     else:
         return word

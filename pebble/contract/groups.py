@@ -36,7 +36,7 @@ def decode(raw: bytes) -> tuple[Member, ...]:
     """Return the members of a group. Raises PayloadError if a member is not allowed, or cannot be read."""
     if len(raw) > MOST_BYTES:
         raise PayloadError(f"{c.GROUP.metric}: {len(raw)} bytes, more than {MOST_BYTES}")
-    codec.plain(c.GROUP, raw)  # within the limits of all commands
+    codec.plain(c.GROUP, raw)  # for its errors alone: no JSON, or beyond the limits of all commands
     commands = _strict_json(codec.trim(raw))
     by = commands.pop(BY, None) if isinstance(commands, dict) else None
     if not isinstance(commands, dict) or not 1 <= len(commands) <= MOST_MEMBERS:

@@ -320,7 +320,7 @@ class Service:
 
         if channel.newest:
             self._inbox.post(handle, newest_of=message.topic)
-        else:  # what ends something gets a name, as named jobs are dropped last; it runs after earlier commands
+        else:  # what ends something is named, so that it is dropped last, and waits behind earlier commands
             self._inbox.post(handle, last_of=message.topic if channel.ends(value) else None)
 
     def _remark(self, channel: Channel, sender: str, text: str) -> None:

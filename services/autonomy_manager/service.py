@@ -95,6 +95,7 @@ class AutonomyManager(Service):
 
     @on(AUTONOMY_COMMAND)
     def command(self, command: AutonomyCommand) -> None:
+        """Start a script, or stop the one that runs; ``enabled`` decides only where ``action`` is no known word."""
         word = (command.action or "").strip().lower()
         is_known = word in (*_START, *STOP_WORDS)
         begin = word in _START if is_known else command.enabled
@@ -237,7 +238,7 @@ class AutonomyManager(Service):
             self._local.release()
             raise
         self._signs, self._unsigned_moves = plan.main.script.ours, False
-        for number in self._owners.steps_to(run):  # zeros of numbers in between: else an owner may think it older
+        for number in self._owners.steps_to(run):  # a zero of each: else an owner may take ``run`` for older
             self.halt(number)
         return run, self._owners.baseline()
 
@@ -272,6 +273,7 @@ class AutonomyManager(Service):
             self.publish(AUTONOMY_STATUS, replace(status, timestamp=time.time()))
 
     def _present_status(self) -> AutonomyStatus:
+        """Return the status. The fields that ``replace`` sets are left out of the message where they do not apply."""
         run = self._runner.run
         main = None if run is None else run.running
         parts = [] if run is None else run.dependencies

@@ -219,7 +219,7 @@ class MqttBridge(ForwardingService):
 
     def connected(self, side: Side, epoch: int) -> None:  # see ForwardingService
         if side is Side.REMOTE:
-            if self.forwarder.gate is Gate.SHUT:  # else subscribe_remote() does that, which follows the check
+            if self.forwarder.gate is Gate.SHUT:  # else subscribe_remote() does that, below or after the check
                 self._publish_heartbeat(at_once=True)
         else:
             barrier(self.transport, self._same_broker.topic)  # until the robot's retained messages have arrived
@@ -269,14 +269,14 @@ class MqttBridge(ForwardingService):
         if self._same_broker.proves_two_brokers(round_):
             self._begin_forwarding()
 
-    def _begin_forwarding(self) -> None:
+    def _begin_forwarding(self) -> None:  # does nothing if it forwards already
         if self.remote.state is not State.CONNECTED or self.forwarder.gate is Gate.OPEN:
             return
         was_shut = self.forwarder.gate is Gate.SHUT
         self.forwarder.open()
         if was_shut:  # what was received meanwhile was dropped: a new subscription brings the retained messages again
             self.unsubscribe(Side.LOCAL)
-            self.forwarder.sides[Side.LOCAL].subscribing()
+            self.forwarder.sides[Side.LOCAL].subscribing()  # as at a new connection
             self.subscribe_local()
             self.forwarder.subscribed(Side.LOCAL)
         self.subscribe_remote()  # only now; the local side was subscribed to while the gate was WAITING
@@ -310,7 +310,7 @@ class MqttBridge(ForwardingService):
         forwards = gate is Gate.OPEN and bool(self.subscriptions[Side.REMOTE])
         passes = self._same_broker.both_connected and (needs_no_bridge or forwards)
         late, refused = counters[f"{Side.REMOTE.value}: {Drop.LATE.value}"], counters[f"{Side.LOCAL.value}: refused"]
-        # Any change of these may mean that a message was lost.
+        # Any change of these may mean a loss on the way in: late from the remote side, or refused by the local one.
         losses = gate, self.epoch, self._local_changes, refused, late, self.transport.counters["dropped"]
         self.publish(c.CONTROL_VOUCHED, self._vouching.check(passes, losses, self.clock()))
 
@@ -359,7 +359,7 @@ class MqttBridge(ForwardingService):
         keys = None  # without a valid state: the stamp of every command is judged
         with suppress(PayloadError):
             state: ControlState = codec.decode(c.CONTROL_STATE, payload)
-            keys = frozenset([state.key.encode()]) - {b""}  # none if no client has control: no stamp is judged
+            keys = frozenset([state.key.encode()]) - {b""}  # key "": no client has control, so no stamp is judged
             self._observers.tell(Observer.control, state)
         self.forwarder.ages.keys = keys
 
@@ -421,7 +421,7 @@ class MqttBridge(ForwardingService):
             self.refusals.stale("a command" if channel is None else channel.metric)
             return
         if isinstance(routed.outcome, Drop) and (routed.outcome in _IGNORED or not is_local):
-            return  # of dropped messages only the robot's own may be requests, unless dropped for these reasons
+            return  # a dropped message is a request only if it is the robot's own, and not dropped for one of _IGNORED
         if channel is None or codec.is_blank(message.payload):
             return
         if not message.retain and routed.outcome is not Drop.KNOWN:  # KNOWN: nothing new for observers

@@ -158,7 +158,7 @@ class StopConnection:
     def main_lost(self, *, ended: bool) -> None:
         """Note that the main connection is lost; ``ended``: the broker has closed it."""
         self._copies.forget()
-        if self._clock() - self._connected_at >= _KICKED_S:  # it was not lost because of this one
+        if self._clock() - self._connected_at >= _KICKED_S:  # not because of this one; never true before it was made
             self._kicks = 0
         elif ended and self.listens:
             self._kicks += 1
@@ -194,7 +194,7 @@ class StopConnection:
         if state is State.CONNECTED:
             self._connected_at = self._clock()
             return
-        doubtful = self._copies.lost()  # dropped as copies, though perhaps only the main connection had them
+        doubtful = self._copies.lost()  # came over the main connection, dropped as copies, perhaps wrongly
         if state is State.CONNECTING:  # it was lost; if it is CLOSED, we have ended it
             for message in doubtful:
                 self._pass_on(message)

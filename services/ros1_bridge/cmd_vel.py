@@ -128,7 +128,7 @@ class CmdVel:
             self._body, self._until, self._zeros = ZERO, 0.0, ZEROS
             if not self._ends:
                 self._out.send(ZERO)
-            if not self._latched:  # else each call would put off the lock, which the thread repeats
+            if not self._latched:  # else each call would put off the next repetition of the lock
                 self._plan(time.monotonic())
 
     def latch(self, latched: bool) -> None:

@@ -47,7 +47,7 @@ class TlsLateError(TimeoutError):
 
 
 def begin_tls(plain: socket.socket, opening: Opening) -> ssl.SSLSocket:
-    """Return a non-blocking socket with TLS, which closes ``plain``; so does a failed handshake. Raises OSError."""
+    """Return a non-blocking socket with TLS that takes over ``plain``. Raises OSError; a failed handshake closes it."""
     assert opening.context is not None  # noqa: S101 - else there is no TLS
     name = opening.settings.host.partition("%")[0]  # without the network card of an address: fe80::1%eth0
     sock = opening.context.wrap_socket(plain, server_hostname=name, do_handshake_on_connect=False)

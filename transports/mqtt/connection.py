@@ -205,7 +205,7 @@ class Connection:
                     self._poll.register(self.client.socket)
         if self.client.socket is None:
             raise self.incoming.lost
-        blocked, waiting = bool(self.client.waiting), self.incoming.age.waiting
+        blocked, waiting = bool(self.client.waiting), self.incoming.age.waiting  # client.waiting: to be written
         began = now = clock.since_boot()
         wait_s = min(timeout, self.pings.due_at - began)
         ready = NOTHING

@@ -162,7 +162,7 @@ class Dialler:
         if late:
             self.addresses.was_slow()
         if self.loses_large or not (silent or late):
-            return False  # they are small already, or it tells nothing of large ones: no silence, no late TLS
+            return False  # segments are small already, or this end tells nothing of large packets
         self._large_lost = self._large_lost + 1 if self._may_have_lost_large(lost) else 0
         return self.loses_large
 
@@ -188,12 +188,12 @@ class Dialler:
         ``held_s``: how long a connection lasted, or 0. Return the problem in words ("": none yet), and True to log it.
         """
         addresses, asks_again = self.addresses, self.limits.asks_again
-        if self._is_last_attempt and not asks_again:  # it was asked in every way, so this address has failed
+        if self._is_last_attempt and not asks_again:  # no other way to ask it is left: this address has failed
             why = problem.removeprefix(f"{addresses.where} ")  # the list of failures names the addresses
             failures = addresses.failed(why, held_s)
             if addresses.several:
                 problem = f"broker {addresses.host_port}: {failures}"
-        if asks_again and held_s <= 0:  # only an attempt has failed: the next one shows what the problem is
+        if asks_again and held_s <= 0:  # not logged: it is asked once more, and that shows the problem
             return "", False
         # Of a round through several addresses, only the end is worth a line.
         return problem, held_s > 0 or addresses.is_over or not addresses.several

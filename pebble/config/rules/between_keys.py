@@ -122,7 +122,7 @@ def _without_uplink(notes: Notes, root: Root) -> Root:
     return replace(root, services=replace(root.services, mqtt_bridge=bridge))
 
 
-def _serial(reader: Reader, serial: SerialBridge, path: Path) -> SerialBridge:
+def _serial(reader: Reader, serial: SerialBridge, path: Path) -> SerialBridge:  # each line: its own port and name
     if "instances" in path:  # the section of an instance
         if serial.instances:
             reader.notes.problem((*path, "instances"), "must be left out: an instance has none")
@@ -135,7 +135,7 @@ def _serial(reader: Reader, serial: SerialBridge, path: Path) -> SerialBridge:
         port = line.serial.port
         if not line.enabled:
             continue
-        if port is None:
+        if port is None:  # a doubt: it may have been refused, which is noted already
             reader.notes.doubt((*place, "serial", "port"), "is missing, write the device: ls /dev/serial/by-id/*")
         elif port in ports:
             reader.notes.problem(place, f"shares {port} with {ports[port]}, write another serial.port")

@@ -99,7 +99,7 @@ class _Session:
             self._legs.watch(TagFinder(wanted.tag_size_m, camera, wanted.family), wanted.tag)
         kinds = [self._straight] * wanted.straights + [self._spin] * wanted.spins
         #: The method of each run, and its sign, in turns: 1 (there, or left), -1 (back, or right). The number of
-        #: straights is even: the runs 0 and 1, 2 and 3, and so on, are pairs of them, there and back.
+        #: straights is even (`check`): runs 0 and 1, 2 and 3, and so on, are pairs of them. So spins begin with 1, too.
         self._drives = [(drive, 1 if number % 2 == 0 else -1) for number, drive in enumerate(kinds)]
         self.runs: list[Run] = []
 

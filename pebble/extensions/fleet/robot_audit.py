@@ -61,7 +61,8 @@ _COMMANDS: dict[str, Callable[[Any], Row]] = {
     LIGHTS_FLASH.suffix: lambda colour: _lights_row(colour),
     OUTLET_COMMAND.suffix: lambda request: {"what": "outlet", "on": request.on},
 }
-_MILD = (SOUNDBOARD_COMMAND, LIGHTS_SOLID, LIGHTS_FLASH)  # their rows take no room that others need
+#: Harmless commands: after OF_STRANGERS different rows in a minute theirs are only counted, so that others have room.
+_MILD = (SOUNDBOARD_COMMAND, LIGHTS_SOLID, LIGHTS_FLASH)
 
 
 def files(config: Config) -> list[Path]:
@@ -78,7 +79,7 @@ class Audit(Observer):
         self._level = config.security.level
         self._writer, self._clock = RowWriter(self._append, clock), clock
         self._holder: ControlState | None = None  # None: not known yet
-        self._owners, self._awaited = config.motor_owners, set[str]()  # those that have not answered the newest reset
+        self._owners, self._awaited = config.motor_owners, set[str]()  # awaited: their answer to the newest reset
         self._refusals = dict[str, str | None]()  # by owner: why it has refused its last reset, if it has
         self._stops = deque[tuple[str, str]](maxlen=_REMEMBERED)  # those that have a row: name and sender
         self._lights = dict[tuple[str, bool], float]()  # when each sender last sent lights, on or off

@@ -52,7 +52,10 @@ def _hub_account(account: Account, held: Iterable[Rule]) -> HubAccount:
 
 
 def _grants(name: str, held: Sequence[Rule], retains: Iterable[str], *, is_hub: bool) -> Iterator[Grant]:
-    """Yield the grants that an account's client needs. It cannot act as a hub, or answer queries of others."""
+    """Yield the grants that an account's client needs. It cannot act as a hub, or answer queries of others.
+
+    ``held``: the account's rules; ``retains``: filters of the topics that it may retain.
+    """
     if is_hub:
         yield from EVERYTHING
         return

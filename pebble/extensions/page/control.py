@@ -131,7 +131,7 @@ class Control:
         if "drive" in self._rights():
             server.drivers.restore(hello.token, self._tab)
         server.robots.join(self._interest)
-        self._interest.dirty |= {(ref, "web/driver") for ref in server.robots.components}  # not by `join`: see _flush
+        self._interest.dirty |= {(ref, "web/driver") for ref in server.robots.components}  # `join` leaves these out
         self._post(self._ping())
 
     def _end(self) -> None:
@@ -213,7 +213,7 @@ class Control:
         """Publish a command to a robot, once. It is not repeated; the robot's states show its effect."""
         if not self._may(robot_commands.right(op), op):
             return
-        why_not = self._why_not if robot_commands.moves(op) else ""
+        why_not = self._why_not if robot_commands.moves(op) else ""  # which forbids driving alone
         if why := why_not or self._server.drivers.refusals.of_op(op):
             self._refuse(op, why)
             return

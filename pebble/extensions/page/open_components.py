@@ -143,9 +143,9 @@ class OpenComponents:
         """Return the callback for messages of a subscription of this component."""
 
         def take(message: Message, now: float) -> None:
-            meaning = self._wanted.get(ref, {}).get(filter_)
+            meaning = self._wanted.get(ref, {}).get(filter_)  # None: the topic's name shows component and channel
             aliases_before = self._robots.aliases(ref)
-            if meaning is None:  # the topic's name shows component and channel
+            if meaning is None:
                 self._robots.receive(message, now)
             elif meaning.channel.kind is c.Kind.FLAG:
                 self._receive_flag(ref, meaning.channel, message)

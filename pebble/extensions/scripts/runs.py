@@ -44,7 +44,8 @@ class LocalScripts:
     def hold(self) -> None:
         """Lock the file while a script runs. The script runs even if this fails.
 
-        Where the system refuses the lock, :meth:`none_runs` does not get it either: no other robot may drive this one.
+        Where the system refuses the lock, it refuses it to :meth:`none_runs`, too. That then yields False, so no script
+        of a neighbour drives this robot: it would need a run number from here, which it gets only while none runs.
         """
         if self._held is None:
             try:
@@ -60,7 +61,10 @@ class LocalScripts:
 
     @contextmanager
     def none_runs(self) -> Iterator[bool]:
-        """Yield True if no script runs, and prevent one during the block; False if one runs, or that is unknown."""
+        """Yield True if no script runs, and prevent one during the block; False if one runs, or that is unknown.
+
+        If it yields False, no script of a neighbour, which is another robot, may drive this one.
+        """
         try:
             file = self._open()
         except OSError as error:

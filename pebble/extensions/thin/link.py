@@ -52,6 +52,7 @@ class ShortestTrip:
         self._parts: deque[tuple[float, float]] = deque()  # when each began, and the shortest in it
 
     def note(self, seconds: float, now: float) -> None:
+        """Note a round trip. A part is forgotten once its last round trip, too, is older than _REMEMBERED_S."""
         began, shortest = self._parts[-1] if self._parts else (-inf, inf)
         if now - began >= _PART_S:
             self._parts.append((now, seconds))

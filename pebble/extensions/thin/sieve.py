@@ -103,7 +103,7 @@ class Sieve:
                 self._event_was_refused = False
                 self._ranks_that_wait.add(rank)
                 return
-            self._event_waits_since = inf  # no event was tried since the last call: it has left its buffer
+            self._event_waits_since = inf  # none waits: it would have been tried since the last call, and refused
         self._ranks_that_wait.discard(rank)
         overdue_since = self._clock() - OVERDUE_S
         for topic, entry in list(self._waiting.items()):

@@ -131,7 +131,7 @@ class EarlierNames:
 
     def __init__(self, config: Config, sides: list[Transport], call_in: CallIn) -> None:
         self._config, self._sides, self._call_in = config, sides, call_in
-        self._begun = config.path is None  # the search, which is made once
+        self._begun = config.path is None  # the search, made once; without a file, by which names are stored, never
 
     def begin(self) -> None:
         """Look for messages of earlier names. Call this when both sides are connected."""

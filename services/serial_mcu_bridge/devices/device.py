@@ -81,11 +81,12 @@ class Device:
         )
 
     def alias_body(self, route: Route, sample: McuSample) -> Payload | None:
-        """Return ``sample`` as the payload of its interface's alias; None for a summary before the first motion sample.
+        """Return ``sample`` as the payload of its interface's :class:`Alias`; None if there is none yet.
 
-        A motion sample is stored as well, because summaries repeat the newest one.
+        An inertial sensor may have two interfaces: for samples of its motion, and for summaries, whose payloads repeat
+        the newest of these. So a sample of motion is stored as well, and a summary before the first one gives None.
         """
-        has_imu_body = route.alias is not None and route.alias.body != ""  # else the alias carries the generic payload
+        has_imu_body = route.alias is not None and route.alias.body != ""  # "": the generic payload
         if route.interface.profile == imu.MOTION and imu.fits(imu.MOTION, sample.value):
             motion = self._reports.motion(sample.t, sample.seq, sample.mcu_ms, sample.value)
             return motion if has_imu_body else sample

@@ -7,7 +7,7 @@ from pebble.extensions.checks.broker import MOSQUITTO, OTHER
 from pebble.extensions.checks.broker.peer import BrokerTrial, Peer, RefusedError
 
 _STATES = 200  # retained ones; a robot has some twenty
-_TRIES = 6  # to get the retained message after a restart
+_TRIES = 6  # to get the retained message after a restart, each for a third of the time for an answer
 _MOST_FILTERS = 8  # filters in one SUBSCRIBE: AWS IoT closes the connection for more
 _PERSISTENT = f"{MOSQUITTO}persistence true, persistence_location /var/lib/mosquitto/, autosave_on_changes true"
 

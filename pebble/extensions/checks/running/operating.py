@@ -159,7 +159,8 @@ def wheels(robot: RobotUnderTest) -> CheckResult:
     """Drive a short way ahead and back, if a person has agreed; after each the robot must stop by itself."""
     if robot.view.charging:
         return skipped("it is on its charger")
-    with at_the_wheel(robot.commanding_side, robot.by.partition("@")[0], _CONTROL_S) as driver:
+    user = robot.by.partition("@")[0]  # without the machine: names of who has control hold no @
+    with at_the_wheel(robot.commanding_side, user, _CONTROL_S) as driver:
         if not driver.may_drive:
             return skipped(f"{robot.commanding_side.view.control.who or 'no one'} has control")
         ahead = _drive(robot, driver, _SPEED)

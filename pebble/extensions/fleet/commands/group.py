@@ -297,8 +297,8 @@ def check_(folder_: _Folder = None) -> int:
     """
     require_packages("pebble fleet")
     with _locked_fleet(folder_) as (place, fleet):
-        others, rules = check.by_hand(place, fleet), check.of_rules(place, fleet)  # to mend by hand; by `apply`
-    code = _print_left(others + rules)
+        by_hand, rules = check.by_hand(place, fleet), check.of_rules(place, fleet)  # `apply` mends only the rules
+    code = _print_left(by_hand + rules)
     if rules:
         typer.echo(f"pebble: `pebble fleet apply --folder {_shown(place)}` writes the rules again", err=True)
     if not code:

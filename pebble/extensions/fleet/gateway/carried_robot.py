@@ -92,7 +92,7 @@ class Beginning:
 def begin(robots: Sequence["CarriedRobot"], hub: Transport, broker: Transport) -> None:
     """Start forwarding for ``robots``, beginning with the hub's retained messages.
 
-    These wait until the forwarders are open. What comes from the broker would be dropped before that: so subscribing
+    Retained messages wait until their forwarder is open, but commands from the broker would be dropped: so subscribing
     there is the last step. All robots share the wait for a side, as a round trip takes longer than all else.
     """
     _subscribe(robots, Side.LOCAL, hub, f"{OUTGOING}/#", f"{INCOMING}/flags/#")
@@ -175,6 +175,7 @@ class CarriedRobot:
                 self.forwarder.retained.synchronize(side)
         if now >= self._probe_at:
             self._probe_at = now + PROBE_PERIOD_S
+            # REMOTE: only from there commands pass (see GATEWAY).
             self.forwarder.publisher.probe_again((Side.REMOTE,), self.forwarder.retained.value)
 
     # -- the transports' threads

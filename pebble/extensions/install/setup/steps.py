@@ -215,13 +215,14 @@ class Job:
         yield self._file("authority of the broker", self.places.etc / BROKER_CA, content)
 
     def _certificate(self) -> Iterator[Step]:
+        """Yield the step that makes a certificate for the page, and an authority that signs it."""
         tls = self.places.tls
         if self.page is not None and self.page.section(WebInterface).tls.certificate != tls / certificates.SERVER_CERT:
-            return  # it has another one
+            return  # the page has another certificate
 
         def fill(new: Path) -> None:
             certificates.init(new, certificates.own_names())
-            (new / certificates.SERVER_KEY).chmod(0o640)  # the robot reads it; only root signs others
+            (new / certificates.SERVER_KEY).chmod(0o640)  # the robot reads it; only root reads the authority's
 
         yield Step("certificate of the page", tls.is_dir, lambda: self.system.make_folder(tls, 0o750, ROBOTS, fill))
 

@@ -84,7 +84,7 @@ def measure(settings: Settings, number: int, progress: Progress) -> Iterator[Cel
     """Yield the results of fresh robots with and without reports of their MCUs, each measured in turns of a second."""
     passes = max(1, round(settings.seconds))
     for load in in_turn((REPORTS, COMMANDS), number):
-        variants = [name for name in settings.variants if name != FLOOR or load == COMMANDS]  # FLOOR has none
+        variants = [name for name in settings.variants if name != FLOOR or load == COMMANDS]  # FLOOR: no reports
         turns: dict[str, list[Turn]] = {variant: [] for variant in variants}
         progress("starting the robots")
         with running(variants, reports=load == REPORTS) as driven:

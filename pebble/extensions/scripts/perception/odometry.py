@@ -170,8 +170,8 @@ class Odometry:
     def __init__(self, settings: OdometrySettings, now: float) -> None:
         self.pose = self._base = WheelPose()  # the base: where the present part begins
         self.distance_mm = 0.0
-        self._part = _Part()
-        self._was_ready = True  # with the last sample
+        self._part = _Part()  # the way since the base
+        self._was_ready = True  # at the last sample no sensor was in its warm-up, which may correct the part
         self._settings = settings
         self._directions = Directions(now)
         self._left, self._right = map(_Wheel, settings.step_mm)
