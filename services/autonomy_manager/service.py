@@ -25,7 +25,7 @@ from pebble.contract.payloads import (
 )
 from pebble.errors import PebbleError
 from pebble.extensions.scripts.config import AutonomyManager as AutonomyManagerSection
-from pebble.extensions.scripts.runs import LocalScripts, following, next_run
+from pebble.extensions.scripts.runs import LocalScriptsLock, following, next_run
 from pebble.motion.arbiter import HOLD_MS
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.process import view_of
@@ -57,7 +57,7 @@ class AutonomyManager(Service):
         motors = self.config.motor_lines()
         #: With the names of topics that are configured for the serial line of the motors.
         self.addresses = Addresses(view_of(self.config, next(iter(motors), "")))
-        self._local = LocalScripts(self.config)
+        self._local = LocalScriptsLock(self.config)
         self._owners = MotorOwners(self.config.motor_owners)
         processes = Processes(self.config.run_dir() / "scripts.lock")
         self.on_stop(processes.close)

@@ -22,7 +22,7 @@ from pebble.contract.identity import Identity
 from pebble.contract.payloads import Drive, Neighbours
 from pebble.errors import PebbleError
 from pebble.extensions.operator.client.robot_estop import RobotEstop
-from pebble.extensions.scripts.runs import LocalScripts, next_run
+from pebble.extensions.scripts.runs import LocalScriptsLock, next_run
 from pebble.extensions.scripts.script.neighbour import PRESENT_S
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.connections import client_of_hub
@@ -50,7 +50,7 @@ class NeighboursService(Service):
         self.addresses = Addresses(view_of(self.config, next(iter(self.config.motor_lines()), "")))
         self._lan = lan or _lan_transport(self.config)
         self._others = {name: Identity(me.system, me.type, name) for name in self._section.listens}
-        self._local = LocalScripts(self.config)
+        self._local = LocalScriptsLock(self.config)
         self._estop = RobotEstop(self.config.base)
         # `begin` without its last two arguments, another robot and its run.
         begins = partial(begin, self.config.state_file("neighbour-runs"), self._section.commanded)

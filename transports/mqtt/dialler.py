@@ -167,11 +167,11 @@ class Dialler:
         return self.loses_large
 
     def is_gone(self, lost: Lost, *, connected: bool, was_ended: bool) -> bool:
-        """True if the broker's process seems to have ended. ``was_ended``: the result of the last call.
+        """True if the broker's process seems to have ended. ``was_ended``: the result of the call before this.
 
-        1. A connection was lost (``connected``): True, unless the broker was only silent. It may be we who stood still.
-        2. Nothing listens there: the last result.
-        3. An attempt failed otherwise: the last result; False after silence, or if 1 or 2 is more than `_ENDING_S` ago.
+        1. A connection was lost (``connected``): True, unless the broker was silent. Then we may have stood still.
+        2. Nothing listens there: this decides nothing, so ``was_ended``.
+        3. An attempt failed otherwise: False after silence, or if 1 and 2 are `_ENDING_S` ago; else ``was_ended``.
         """
         now, was_silent = time.monotonic(), isinstance(lost, Silent)
         if connected:
