@@ -55,7 +55,7 @@ _ENDING_S = 5.0  # for processes that are about to end
 
 #: Folders and modules of tests that check no times.
 _COMPUTING = (
-    *("commands/", "config/", "contract/", "core/test_extensions", "ext/checks/test_check.", "ext/install/setup/"),
+    *("commands/", "config/", "contract/", "core/test_extensions", "ext/checks/test_check.", "ext/install/setup/test_steps."),
     *("ext/media/", "ext/page/modules/", "ext/recordings/exports/", "ext/recordings/files/", "ext/recordings/seek/"),
     *("ext/recordings/test_unread", "ext/recordings/traffic/", "ext/scripts/perception/", "motion/"),
 )
