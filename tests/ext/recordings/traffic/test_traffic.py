@@ -166,7 +166,7 @@ LATE = [number * 0.25 for number in range(20)] + [4.75 + 0.375 + number * 0.25 f
     [
         (steady(GOOB, (20.0, 22.0)), [1750.0]),  # beyond the usual interval
         (heartbeats(GOOB, LATE), []),  # of up to one and a half
-        (steady(GOOB, (20.0, 90.0), seconds=120.0), []),  # above a minute it was offline
+        (steady(GOOB, (20.0, 80.25), seconds=120.0), []),  # above a minute it was offline
         (ordered(steady(GOOB, (20.0, 22.0), (40.0, 41.0)), [GAP]), [750.0]),  # what was not recorded is none
         (ordered(steady(GOOB, (20.0, 22.0)), [event(21, "start")]), []),
     ],
