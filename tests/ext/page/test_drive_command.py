@@ -15,7 +15,7 @@ import pytest
 from pebble.extensions.page.commands.terminal_driver import TerminalDriver
 from pebble.transports import Message
 from tests.commands.command_line import Run
-from tests.ext.operator.client.estop_robot import Robot, outgoing
+from tests.ext.operator.client.estop_robot import KeepingRobot, Robot, outgoing
 from tests.kit.played_robot import RecordingRobot
 from tests.kit.terminal import Terminal
 from tests.support import SOON_S, WAIT_S, Broker, until
@@ -318,3 +318,11 @@ def test_who_leaves_sends_a_last_zero_and_nothing_more_than_twice_after_it() -> 
     cab.run(0.5, "w")
     cab.driver.end(cab.now, leave=True)
     assert cab.run(1.0) == [{"x": 0, "z": 0, "y": 0, "valid_ms": 0}] * 3
+
+
+def test_a_request_for_control_that_is_not_answered_is_named() -> None:
+    cab = Cab()
+    cab.robot.value["drive"] |= {"control": True}
+    cab.receive(cab.robot.capabilities(), *(owner.state() for owner in cab.robot.owners), *KeepingRobot(GOOB).states())
+    cab.run(6.0)
+    assert cab.driver.status().endswith(" · goob does not answer")
