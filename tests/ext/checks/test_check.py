@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from pebble.extensions.checks.check import some_of
 from pebble.extensions.checks.report import report
 from pebble.extensions.checks.report.report import make
 from pebble.extensions.checks.report.secrets_here import secrets_of, values_in
@@ -26,6 +27,10 @@ def test_every_config_we_ship_is_right(run: Run, path: Path) -> None:
     assert run.err == ""
     assert run.out.startswith("pebble/")
     assert max(map(len, run.out.splitlines())) <= 80
+
+
+def test_names_beyond_the_first_three_are_counted() -> None:
+    assert [some_of("abc"), some_of("abcd")] == ["a, b, c", "a, b, c, and 1 more"]
 
 
 def test_check_reads_the_certificates(run: Run, tmp_path: Path) -> None:

@@ -249,6 +249,7 @@ def test_after_a_missing_picture_none_is_passed_on_until_the_next_key_frame() ->
     assert complete[:4] == [True, True, True, False]
     assert complete[4:] == sorted(complete[4:])  # from the key frame on all of them
     assert complete[-1]
+    assert [len(found._converters(one)) - 1 for one in found.waiting] == complete  # as video, too
 
 
 def test_a_message_that_is_too_large_is_dropped_and_counted() -> None:

@@ -15,7 +15,7 @@ import pytest
 from pebble.extensions.page.commands.terminal_driver import TerminalDriver
 from pebble.transports import Message
 from tests.commands.command_line import Run
-from tests.ext.operator.client.estop_robot import Robot, outgoing
+from tests.ext.operator.client.estop_robot import KeepingRobot, Robot, outgoing
 from tests.kit.played_robot import RecordingRobot
 from tests.kit.terminal import Terminal
 from tests.support import SOON_S, WAIT_S, Broker, until
@@ -26,8 +26,9 @@ Drive = Callable[..., Terminal]
 
 
 @pytest.fixture
-def lamp(broker: Broker) -> Iterator[RecordingRobot]:
-    with RecordingRobot(broker.port, f"pebble/robots/lamp{next(NUMBERS)}", keeps=True) as one:
+def lamp(broker: Broker, request: pytest.FixtureRequest) -> Iterator[RecordingRobot]:
+    named = getattr(request, "param", False)
+    with RecordingRobot(broker.port, f"pebble/robots/lamp{next(NUMBERS)}", keeps=True, named=named) as one:
         yield one
 
 
@@ -96,6 +97,12 @@ def test_a_held_key_drives_and_its_release_stops(drive: Drive, lamp: RecordingRo
     assert console.process.wait(WAIT_S) == 0
     assert console.restored
     assert until(lambda: owner.by == "")
+
+
+@pytest.mark.parametrize("lamp", [True], ids=["named"], indirect=True)
+def test_a_robot_that_wants_names_gets_them(drive: Drive, lamp: RecordingRobot, url: str) -> None:
+    driving(drive("--url", url.replace("//", "//ann@")), lamp)
+    assert f"{lamp.base}/incoming/by/ann/drive-values" in lamp.wire
 
 
 #: What ends a drive, and the exit status; None: the program goes on.
@@ -344,3 +351,11 @@ def test_who_leaves_sends_a_last_zero_and_nothing_more_than_twice_after_it() -> 
     cab.run(0.5, "w")
     cab.driver.end(cab.now, leave=True)
     assert cab.run(1.0) == [{"x": 0, "z": 0, "y": 0, "valid_ms": 0}] * 3
+
+
+def test_a_request_for_control_that_is_not_answered_is_named() -> None:
+    cab = Cab()
+    cab.robot.value["drive"] |= {"control": True}
+    cab.receive(cab.robot.capabilities(), *(owner.state() for owner in cab.robot.owners), *KeepingRobot(GOOB).states())
+    cab.run(6.0)
+    assert cab.driver.status().endswith(" · goob does not answer")

@@ -194,9 +194,9 @@ SECONDS = 20
 
 @pytest.fixture(scope="module")
 def served(broker: Broker, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    """Twenty seconds, two minutes of nothing, and a message."""
+    """Twenty seconds, twelve of nothing, and a message."""
     folder = film(tmp_path_factory.mktemp("recordings"), "pbvd", SECONDS)
-    write(folder / "later.mcap", [Line(SECONDS + 120.0, f"{GOOB}/outgoing/sensors/imu", js(t=ms(140), n=1))])
+    write(folder / "later.mcap", [Line(SECONDS + 12.0, f"{GOOB}/outgoing/sensors/imu", js(t=ms(140), n=1))])
     with Served(broker.port, recordings=folder) as running:
         yield running
 
@@ -294,7 +294,7 @@ def test_it_is_played_at_its_speed_paused_and_leaves_gaps_out(viewer: Viewer) ->
     viewer.send(op="play", on=True)
     assert viewer.until(lambda: viewer.played.get("ended"))
     assert viewer.played["speed"] == 8
-    assert viewer.skipped == [pytest.approx(ms(SECONDS), abs=100), ms(SECONDS + 120)]
+    assert viewer.skipped == [pytest.approx(ms(SECONDS), abs=100), ms(SECONDS + 12)]
     assert viewer.until(lambda: viewer.values["sensors/imu"]["n"] == 1)
     viewer.seek(5.0)
     assert viewer.until(viewer.shown)

@@ -55,6 +55,7 @@ def test_list_and_info(folder: Path, run: Run) -> None:
 def test_search(folder: Path, run: Run) -> None:
     run("recordings", "search", folder, "--robot", "goob", "--topic", "outgoing/logs", "--text", "battery")
     (line,) = run.out.splitlines()
+    assert re.match(r"20\d\d-\d\d-\d\d \d\d:\d\d:\d\d\.\d{3}  pebble", line)
     assert line.endswith('{"level": "WARNING", "message": "low \\n battery"}')
     assert run.err == "1 message\n"
     run("recordings", "search", folder, "-t", f"{FRED}/#", "-n", "3")
@@ -88,6 +89,18 @@ def test_one_robot_is_deleted(folder: Path, run: Run) -> None:
     assert messages(folder) == 101
     assert run("recordings", "info", folder) == 0
     assert "fred" not in run.out
+
+
+@pytest.mark.parametrize(
+    ("option", "words", "deleted"),
+    [
+        ("--since", "from 2000-01-01 00:00:00 UTC to the end", 100),
+        ("--until", "from the beginning to 2000-01-01 00:00:00 UTC", 0),
+    ],
+)
+def test_the_period_of_a_deletion_is_named(folder: Path, run: Run, option: str, words: str, deleted: int) -> None:
+    assert run("recordings", "rm", folder, "--robot", "fred", option, "2000-01-01T00:00:00Z", "--yes") == 0
+    assert run.out.endswith(f"{words}\n{deleted} messages deleted\n")
 
 
 def test_a_robot_is_found_by_a_name_that_looks_the_same(tmp_path: Path, run: Run) -> None:

@@ -193,7 +193,7 @@ def test_what_cannot_be_read_is_named_and_not_touched(
         assert (code, NAME in run.err, wanted in run.err) == (1, True, True), (command, run.out, run.err)
         assert path.read_bytes() == data
     assert run("recordings", "rm", path, "--yes") == 0
-    assert not path.exists()
+    assert (run.out, path.exists()) == (f"{path.name}: deleted\n", False)
 
 
 def test_a_flipped_bit_anywhere_costs_no_message_at_a_deletion(tmp_path: Path) -> None:

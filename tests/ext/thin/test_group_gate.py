@@ -10,6 +10,7 @@ from pebble.contract import DRIVE as DRIVE_CHANNEL
 from pebble.contract import LIGHTS_SOLID, MCU_COMMAND, OUTLET_COMMAND, codec, groups
 from pebble.errors import ConfigError, PayloadError
 from pebble.extensions.thin.group_gate import copy_of, is_marked
+from pebble.extensions.thin.uplink import MediaHold
 from pebble.forwarding.forwarder import Forwarder
 from pebble.forwarding.routing import Drop, Forward
 from pebble.launcher.capabilities import capabilities
@@ -53,11 +54,14 @@ COPIES = [("drive-values", {"z": 0.5, "group": True}), ("lights-solid", {"r": 1,
 
 
 @pytest.mark.parametrize("profile", ["wide", "thin"])
-def test_a_group_passes_whole_and_then_as_copies(start: Start, profile: str) -> None:
+def test_a_group_passes_whole_and_then_as_copies(start: Start, profile: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    noted: list[float] = []  # when media begin to wait
+    monkeypatch.setattr(MediaHold, "note_drive", lambda _self, now: noted.append(now))
     world = start(profile)
     world.remote.publish(GROUP, BOTH)
     world.run(0.1)
     assert arrived(world) == [("group", {"drive-values": {"z": 0.5}, "lights-solid": {"r": 1}}), *COPIES]
+    assert len(noted) == (profile == "thin")
 
 
 def test_a_bridge_that_ends_behind_the_group_leaves_it_whole(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -238,6 +242,7 @@ def test_a_group_with_a_bad_member_is_refused(raw: bytes) -> None:
         (b'{"z": 1, "gr\\u006fup": true}', True),
         (b'{"value": {"z": 1, "group": true}}', True),
         (b'{"group": ', False),
+        (b'{"z": 1, "by": "group", "value": 1}', False),
     ],
 )
 def test_marks_are_found_however_they_are_written(raw: bytes, marked: bool) -> None:

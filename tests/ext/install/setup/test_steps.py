@@ -17,7 +17,7 @@ import pytest
 from pebble.extensions.install.commands import setup as command
 from pebble.extensions.install.setup import system
 from pebble.extensions.install.setup.robot_config import changed
-from pebble.extensions.install.setup.system import MOSQUITTO, ROBOT, SetupError, System
+from pebble.extensions.install.setup.system import MOSQUITTO, ROBOT, ROBOTS, SetupError, System
 from pebble.extensions.operator.places import Places
 from tests.commands.command_line import Run
 from tests.ext.install.setup.conftest import ANSWERS, PASSWORD, answers_in, in_child, machine_root, set_up, tree
@@ -149,7 +149,7 @@ def test_no_password_is_shown_or_stored_but_where_it_belongs(root: Path, tmp_pat
 # -- as root
 
 
-OWNERS = {ROBOT: (65534, 65534), MOSQUITTO: (1, 1)}
+OWNERS = {ROBOTS: (0, 65534), ROBOT: (65534, 65534), MOSQUITTO: (1, 1)}
 _ACTS = (
     "open",
     "sqlite3.connect",
@@ -225,6 +225,7 @@ def test_in_folders_of_others_root_is_their_owner(
             at(other)
             run("setup", "--from", place / "goob.tar")
         assert not _acts
+        assert {Places(root).config.stat().st_gid for root in (here, other)} == {OWNERS[ROBOTS][1]}
         assert (people.parent / "tls/ca.key").stat().st_uid == OWNERS[ROBOT][0]
         assert Places(other).people.stat().st_uid == OWNERS[ROBOT][0]
         assert {path.lstat().st_uid for path in Places(other).broker_folder.iterdir()} == {OWNERS[MOSQUITTO][0]}

@@ -6,6 +6,7 @@ import io
 import json
 import re
 import ssl
+import threading
 import time
 import urllib.error
 import urllib.request
@@ -154,6 +155,19 @@ def test_operators_end_first_and_brokers_last(tmp_path: Path) -> None:
         assert processes.unexpected_exits() == []
     assert order.read_text().split() == ["operator", "robot", "mcu", "broker"]
     assert not processes.folder.exists()
+
+
+def test_a_program_ends_with_the_thread_that_started_it(tmp_path: Path) -> None:
+    started: list[Program] = []
+
+    def start() -> None:
+        started.append(Program("sleeper", ["sleep", "30"], tmp_path / "log"))
+        assert until(lambda: Path(f"/proc/{started[0].pid}/comm").read_text() == "sleep\n")
+
+    thread = threading.Thread(target=start)
+    thread.start()
+    thread.join()
+    assert until(lambda: started[0].ended)
 
 
 def test_one_that_ended_by_itself_is_named_and_one_that_was_ended_is_not(tmp_path: Path) -> None:

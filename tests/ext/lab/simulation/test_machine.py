@@ -61,6 +61,8 @@ def test_the_watchdog_counts_and_starves(board: Board, clock: VirtualClock) -> N
     clock.advance(2.5)
     with pytest.raises(BoardReset):
         dog.feed()
+    board.boot()
+    assert not board.watchdog.starved(clock.now() + 1e9)
 
 
 def test_reading_more_than_there_is_would_hang(board: Board) -> None:

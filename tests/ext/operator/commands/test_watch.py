@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import tempfile
+from contextlib import closing
 from pathlib import Path
 
 import cv2
 
 from tests.commands.command_line import Run, config_file
 from tests.ext.av.media_rig import HEIGHT, WIDTH, Filming
-from tests.support import Broker
+from tests.ext.foxglove.live import client
+from tests.ext.page.media.robots import PictureRobot
+from tests.support import Broker, until
 
 
 def test_a_picture_is_of_the_local_camera(run: Run, broker: Broker, tmp_path: Path) -> None:
@@ -27,3 +30,14 @@ def test_a_picture_is_of_the_local_camera(run: Run, broker: Broker, tmp_path: Pa
     picture = cv2.imread(str(file))
     assert picture is not None
     assert picture[5, 5].tolist() == [10, 20, 30]
+
+
+def test_with_an_address_it_is_the_first_that_comes_and_no_more_are_wanted(
+    run: Run, broker: Broker, tmp_path: Path
+) -> None:
+    robot, file = PictureRobot(transport=client(broker)), tmp_path / "view.png"
+    with closing(robot):
+        url = f"mqtt://127.0.0.1:{broker.port}"
+        assert run("watch", "goob", "--url", url, "-e", "pbvd", "--picture", file) == 0, run.err
+        assert run.out == f"{file}: 160×120\n"
+        assert until(lambda: robot.encodings == ["pbvd", None])

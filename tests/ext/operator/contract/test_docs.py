@@ -31,6 +31,7 @@ def test_the_page_names_topics_of_the_contract_and_the_table_each() -> None:
     assert set(ROWS) <= {channel.suffix for channel in CHANNELS}
     table = topics_document()
     assert [channel.suffix for channel in CHANNELS if f"| `{channel.suffix}` |" not in table] == []
+    assert "| `incoming/flags/mqtt-video` | last change;" in table
 
 
 @pytest.mark.parametrize("channel", [channel for channel in CHANNELS if ROWS.get(channel.suffix, "")[:1] in ("{", "t")])

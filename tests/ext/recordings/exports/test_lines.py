@@ -110,12 +110,14 @@ def test_there_and_back(messages: list[Recorded]) -> None:
     ("changes", "flags"),
     [
         ({}, {"qos": "1", "retain": "0"}),
+        ({"payload_truncated": None}, {"qos": "1", "retain": "0"}),
         ({"retain": True}, {"qos": "1", "retain": "1", "retained": "1"}),  # from before its subscription
         ({"payload_truncated": True, "payload_size_bytes": 9000}, {"qos": "1", "retain": "0", "truncated": "1"}),
     ],
 )
 def test_a_line_of_the_loggers(changes: dict[str, object], flags: dict[str, str]) -> None:
-    (message,) = read(json.dumps(LINE | changes).encode() + b"\n")
+    line = {key: value for key, value in (LINE | changes).items() if value is not None}
+    (message,) = read(json.dumps(line).encode() + b"\n")
     assert isinstance(message, Recorded)
     assert shown(message) == (MESSAGE.log_ns, TOPIC, MESSAGE.payload, flags)
 
@@ -158,6 +160,7 @@ def test_stamps(stamp: str, expected_ns: int) -> None:
         json.dumps(LINE | {"timestamp": "0001-01-01T00:00:00"}).encode(),
         json.dumps(LINE | {"timestamp": -1}).encode(),
         json.dumps(LINE).replace("1732300000.25", "NaN").encode(),
+        json.dumps(LINE).replace("1732300000.25", "9223372036.854775808").encode(),
     ],
 )
 def test_bad_lines_are_reported_and_the_others_read(line: bytes) -> None:

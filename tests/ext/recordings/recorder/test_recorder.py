@@ -243,7 +243,7 @@ class TestDisk:
         assert running.written(written + 150)  # the others of the queue, and then once more
         dropped = running.recorder.counters["dropped"]
         running.stop()
-        assert dropped > 50
+        assert 50 < dropped < 115, "pictures have three quarters of the queue"
         assert len(payloads(running.root)) == 152
         assert sum(event["messages"] for event in events(running.root, "dropped")) == dropped
 

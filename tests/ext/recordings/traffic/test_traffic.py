@@ -20,6 +20,7 @@ from pebble.errors import PebbleError
 from pebble.extensions.media.packets import Codec, Picture, PictureKind, Sound
 from pebble.extensions.recordings.files.recorded import Recorded
 from pebble.extensions.recordings.library import merged
+from pebble.extensions.recordings.traffic import figures
 from pebble.extensions.recordings.traffic.activity import Activity
 from pebble.extensions.recordings.traffic.analysis import analyse
 from pebble.extensions.recordings.traffic.index import COLUMNS, PICTURE, SOUND, index_path, write_index
@@ -34,6 +35,7 @@ from pebble.extensions.recordings.traffic.results import (
     TOTAL,
     VIDEO,
     VOICE,
+    Bandwidth,
     Gap,
     RobotTraffic,
     Traffic,
@@ -166,7 +168,7 @@ LATE = [number * 0.25 for number in range(20)] + [4.75 + 0.375 + number * 0.25 f
     [
         (steady(GOOB, (20.0, 22.0)), [1750.0]),  # beyond the usual interval
         (heartbeats(GOOB, LATE), []),  # of up to one and a half
-        (steady(GOOB, (20.0, 90.0), seconds=120.0), []),  # above a minute it was offline
+        (steady(GOOB, (20.0, 80.25), seconds=120.0), []),  # above a minute it was offline
         (ordered(steady(GOOB, (20.0, 22.0), (40.0, 41.0)), [GAP]), [750.0]),  # what was not recorded is none
         (ordered(steady(GOOB, (20.0, 22.0)), [event(21, "start")]), []),
     ],
@@ -383,6 +385,19 @@ def test_nothing_is_loaded_or_run_and_every_drawing_has_a_name(recorded, tmp_pat
     drawings = re.findall(r"<svg\b[^>]*>", page)
     assert len(drawings) == 3 * len(recorded.robots)
     assert all('role="img"' in drawing and 'aria-label="' in drawing for drawing in drawings)
+
+
+@pytest.mark.parametrize(("base", "numbers"), [(FRED, "4.1 4.2 4.3"), (BENJR, "4.4 4.5 4.6 4.3")])
+def test_a_figure_has_its_number_in_the_paper(recorded, base, numbers):
+    text = " ".join(figure.number for figure in figures.figures(robot(recorded, base)))
+    assert re.findall(r"\d\.\d", text) == numbers.split()
+
+
+def test_marks_of_sessions_and_of_idle_time_have_their_values():
+    axes = pytest.importorskip("matplotlib.figure").Figure().add_subplot()
+    bandwidths = {SESSION: 500.0, IDLE: 2.0}
+    figures.draw_bandwidth(axes, [Bandwidth(VIDEO, when, 1, kbps, kbps, 1, 1) for when, kbps in bandwidths.items()])
+    assert {line.get_label(): list(line.get_xdata()) for line in axes.lines} == {"in sessions": [500.0], "idle": [2.0]}
 
 
 def test_gaps_and_losses_stand_out(recorded):

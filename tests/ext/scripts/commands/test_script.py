@@ -45,8 +45,8 @@ class Manager:
         self.offer("follow")
         self.publish(AutonomyStatus(running=False, timestamp=1.0))
 
-    def offer(self, file: str) -> None:
-        self._publish(AUTONOMY_FILES, AutonomyFiles(files=[ENTRY | {"file": file}], timestamp=1.0))
+    def offer(self, file: str, **more: bool) -> None:
+        self._publish(AUTONOMY_FILES, AutonomyFiles(files=[ENTRY | {"file": file} | more], timestamp=1.0))
 
     def publish(self, status: AutonomyStatus) -> None:
         self._publish(AUTONOMY_STATUS, status)
@@ -111,6 +111,12 @@ def test_a_script_that_dies_at_once_is_an_error(run: Run, config: Path, manager:
 def test_a_start_without_a_script_names_the_command_that_lists_them(run: Run, config: Path) -> None:
     assert run("script", "start", config, "--tag-id", "7") == 1
     assert run.err == f'pebble: which script? see "pebble script list {config}"\n'
+
+
+def test_a_script_that_was_not_asked_yet_is_not_started(run: Run, config: Path, manager: Manager) -> None:
+    manager.offer("follow", asked=False)
+    assert run("script", "start", config, "follow") == 1
+    assert run.err == "pebble: the robot has just started, and still asks follow what it needs: try again\n"
 
 
 def test_by_url_it_needs_the_robots_id(run: Run, broker: Broker, manager: Manager) -> None:

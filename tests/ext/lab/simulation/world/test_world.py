@@ -25,7 +25,7 @@ import serial
 import pebble.extensions.lab.simulation.world
 from pebble import Robot
 from pebble.errors import ConfigError, DeviceError
-from pebble.extensions.lab.simulation.motion import FULL_SPEED_MM_S
+from pebble.extensions.lab.simulation.motion import FULL_SPEED_MM_S, Pose
 from pebble.extensions.lab.simulation.trace import read_trace
 from pebble.extensions.lab.simulation.world.lockstep import LockstepRobot, LockstepWorld
 from pebble.extensions.lab.simulation.world.pose_page import PosePage, PoseReader, page_path
@@ -405,3 +405,5 @@ def test_robots_stop_each_other_and_neither_is_pushed() -> None:
     driven(4.0, 1, 1, world)
     assert world.robots["fred"].pose == fred
     assert world.robots["goob"].pose.x == pytest.approx(0.8, abs=1e-4)
+    world.robots["fred"].motion.place(Pose(0.0, 1000.0, 0.0))
+    assert driven(1.0, 1, 1, world).robots["goob"].pose.x > 0.9, "it leaves no obstacle behind"
