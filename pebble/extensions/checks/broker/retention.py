@@ -54,8 +54,10 @@ def before_pong(trial: BrokerTrial) -> CheckResult:
     reader.subscribe(*filters, qos=0)
     reader.ping()
     trial.wait(lambda: len(reader.received) >= expected)
+    if (count := len(reader.received)) < expected:
+        return warn(f"{count} of {expected} come")
     received_before_pong = reader.pongs[0] if reader.pongs else 0
-    late = len(reader.received) - received_before_pong
+    late = count - received_before_pong
     return warn(f"{late} of {expected} come later") if late else ok("all of them")
 
 

@@ -124,6 +124,15 @@ class Busy(Fault):
         return super().up(first, body)
 
 
+class HangsUp(Fault):
+    """Ends a connection that subscribes all topics."""
+
+    def up(self, first: int, body: bytes) -> list[bytes]:
+        if kind(first) == SUBSCRIBE and b"/#" in body:
+            raise OSError
+        return super().up(first, body)
+
+
 class SendsBack(Fault):
     """Takes bridge mode and does not keep it; does not take MQTT 5."""
 
@@ -203,6 +212,7 @@ FAULTS = [
     (FloodsWithAnswers, "rights", "without end"),
     further(Mute, "answers to pings", "does not answer"),
     (EagerPongs, "answers to pings", "before it has passed on what came before"),
+    (HangsUp, "retained, before an answer to a ping", "0 of 200 come"),
     (SendsBack, "bridge mode", "own messages come back"),
 ]
 
