@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import threading
 from contextlib import closing
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from tests.commands.command_line import Run, config_file
 from tests.ext.av.media_rig import HEIGHT, WIDTH, Filming
 from tests.ext.foxglove.live import client
 from tests.ext.page.media.robots import PictureRobot
-from tests.support import Broker, until
+from tests.support import Broker, beside, until
 
 
 def test_a_picture_is_of_the_local_camera(run: Run, broker: Broker, tmp_path: Path) -> None:
@@ -36,7 +37,13 @@ def test_with_an_address_it_is_the_first_that_comes_and_no_more_are_wanted(
     run: Run, broker: Broker, tmp_path: Path
 ) -> None:
     robot, file = PictureRobot(transport=client(broker)), tmp_path / "view.png"
-    with closing(robot):
+    robot.mute = True  # what it loses is asked for again
+
+    def hear() -> None:
+        assert until(lambda: [request["enabled"] for request in robot.requests] == [True, True])
+        robot.mute = False
+
+    with closing(robot), beside(hear, threading.Event()):
         url = f"mqtt://127.0.0.1:{broker.port}"
         assert run("watch", "goob", "--url", url, "-e", "pbvd", "--picture", file) == 0, run.err
         assert run.out == f"{file}: 160×120\n"
