@@ -6,6 +6,7 @@ import io
 import json
 import re
 import ssl
+import subprocess
 import time
 import urllib.error
 import urllib.request
@@ -25,7 +26,7 @@ from pebble.extensions.lab.demo.main import run
 from pebble.extensions.lab.demo.operator import Operator
 from pebble.extensions.lab.demo.phone import NAME, Phone, qr_lines
 from pebble.extensions.lab.demo.visitors import DRIVES_S, Visitors
-from pebble.extensions.lab.rig.processes import BROKERS, MCUS, OPERATORS, ROBOTS, Processes, Program, end_all
+from pebble.extensions.lab.rig.processes import BROKERS, MCUS, OPERATORS, ROBOTS, Processes, Program, end_all, python
 from pebble.extensions.lab.rig.scripted_operator import VALID_MS, ScriptedOperator
 from pebble.extensions.lab.rig.testbed import PageServer
 from pebble.extensions.operator.client.robot_view import RobotView
@@ -154,6 +155,15 @@ def test_operators_end_first_and_brokers_last(tmp_path: Path) -> None:
         assert processes.unexpected_exits() == []
     assert order.read_text().split() == ["operator", "robot", "mcu", "broker"]
     assert not processes.folder.exists()
+
+
+def test_a_program_imports_nothing_of_the_folder_that_we_are_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "json.py").write_text("raise SystemExit('of this folder')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+    assert subprocess.run(python("json.tool", "--help"), check=False).returncode == 0
 
 
 def test_one_that_ended_by_itself_is_named_and_one_that_was_ended_is_not(tmp_path: Path) -> None:
