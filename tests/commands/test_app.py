@@ -56,6 +56,7 @@ def test_a_command_imports_no_other() -> None:
     ("arguments", "named", "help_"),
     [
         (("flyy",), "flyy", "pebble --help"),
+        (("mqtt://me:sentinel@a",), "mqtt://***@a", "pebble --help"),
         (("up",), "CONFIG", "pebble up --help"),
         (("sim", "bob"), "bob", "pebble sim --help"),
         (("sim", "minilamp"), "--broker URL", "pebble sim --help"),

@@ -182,6 +182,21 @@ def test_a_tag_measures_ways_and_turns_without_a_person_and_a_gyroscope_the_turn
     assert abs(track) < 0.5
 
 
+def test_a_spin_that_ends_past_its_tag_turns_back(tmp_path: Path, finder: type[Finder]) -> None:
+    slow_steps, pushed = 0, False
+
+    def at_step(robot: Measured) -> None:
+        nonlocal slow_steps, pushed
+        pose, mm_s = robot.body.pose, abs(robot.body.motion.left_mm_s)
+        if not mm_s and slow_steps > 50 and not pushed:  # fewer: a fast leg that began and ended
+            robot.body.place(pose.x, pose.y, pose.heading + math.radians(50))
+            pushed = True
+        slow_steps = slow_steps + (20 < mm_s < 80) if mm_s else 0
+
+    measure(tmp_path, wanted=Wanted(truth="tag", **SHORT), at_step=at_step)
+    assert pushed
+
+
 @pytest.mark.thorough
 def test_rendered_pictures_of_a_tag_give_the_heading_and_a_scale_within_2_percent(tmp_path: Path) -> None:
     measure(tmp_path, wanted=Wanted(truth="tag", **SHORT))

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import datetime
+import errno
 import json
 import os
 import re
 import shutil
+import signal
 import socket
 import ssl
 import stat
@@ -25,7 +27,8 @@ from msgspec.structs import replace
 
 from pebble.extensions.fleet import authority, broker_files, check
 from pebble.extensions.fleet.certificates import CertificateError, init, renew, show
-from pebble.extensions.fleet.folder import ACL, CONF, FLEET, PASSWORDS, Extra, FleetError, load, locked, refused
+from pebble.extensions.fleet.folder import ACL, CONF, FLEET, PASSWORDS, ZENOH, Extra, FleetError, load, locked, refused
+from pebble.extensions.fleet.hub_access import read_access
 from pebble.extensions.fleet.roles import Account
 from tests.commands.command_line import Run
 from tests.ext.fleet.brokers import BrokerClient, FleetBroker, RefusedError
@@ -118,6 +121,20 @@ def test_a_change_while_mosquitto_is_down_counts_when_it_runs(broker: FleetBroke
     broker.start()
     assert check.of_rules(broker.folder, broker.fleet) == []
     assert [_gets_in(broker, name) for name in ("zoe", "otto", "goob")] == [True, False, True]
+
+
+def test_hubs_keep_out_who_is_removed_whatever_the_broker_does(
+    broker: FleetBroker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broker.change(replace(broker.fleet, hubs="here"))
+
+    def refuse(*_: object) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(signal, "pidfd_send_signal", refuse)
+    with pytest.raises(FleetError, match="Operation not permitted; send it SIGHUP"):
+        broker.remove("otto")
+    assert set(read_access(broker.folder / ZENOH).accounts) == {"goob"}
 
 
 def test_a_password_survives_a_change_of_level(broker: FleetBroker) -> None:

@@ -328,6 +328,18 @@ def test_gateways_of_other_robots_share_a_broker() -> None:
     assert world.all_pass()
 
 
+def test_after_an_outage_it_says_nothing_of_before(alone: World) -> None:
+    heartbeat, suffix = will("a").topic, ONLINE.suffix
+    other = Client(Connection("other", alone.broker, alone), heartbeat.removesuffix(f"/{suffix}"))  # type: ignore[arg-type]
+    alone.running["a"].presence.cut()
+    alone.run(1)
+    del alone.broker.retained[heartbeat]  # its will does so
+    other.seen.clear()
+    alone.running["a"].presence.mend()
+    alone.run(1)
+    assert {tuple(json.loads(one)["robots"]) for one in other.payloads(suffix) if one} == {()}
+
+
 @pytest.mark.parametrize("names", [("a", "b"), ("a", "a")])
 def test_of_two_that_begin_together_one_leaves_the_robots(names: tuple[str, str]) -> None:
     world = World()

@@ -6,6 +6,7 @@ import io
 import json
 import re
 import ssl
+import subprocess
 import threading
 import time
 import urllib.error
@@ -26,7 +27,7 @@ from pebble.extensions.lab.demo.main import run
 from pebble.extensions.lab.demo.operator import Operator
 from pebble.extensions.lab.demo.phone import NAME, Phone, qr_lines
 from pebble.extensions.lab.demo.visitors import DRIVES_S, Visitors
-from pebble.extensions.lab.rig.processes import BROKERS, MCUS, OPERATORS, ROBOTS, Processes, Program, end_all
+from pebble.extensions.lab.rig.processes import BROKERS, MCUS, OPERATORS, ROBOTS, Processes, Program, end_all, python
 from pebble.extensions.lab.rig.scripted_operator import VALID_MS, ScriptedOperator
 from pebble.extensions.lab.rig.testbed import PageServer
 from pebble.extensions.operator.client.robot_view import RobotView
@@ -168,6 +169,15 @@ def test_a_program_ends_with_the_thread_that_started_it(tmp_path: Path) -> None:
     thread.start()
     thread.join()
     assert until(lambda: started[0].ended)
+
+
+def test_a_program_imports_nothing_of_the_folder_that_we_are_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "json.py").write_text("raise SystemExit('of this folder')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+    assert subprocess.run(python("json.tool", "--help"), check=False).returncode == 0
 
 
 def test_one_that_ended_by_itself_is_named_and_one_that_was_ended_is_not(tmp_path: Path) -> None:

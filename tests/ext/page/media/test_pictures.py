@@ -107,7 +107,9 @@ async def test_payloads_arrive_unchanged_and_decodable(
 async def test_a_page_that_wants_a_key_frame_gets_one(robot: PictureRobot, server: Server) -> None:
     page = server.open(PicturePage())
     await until(lambda: len(page.frames) > 5)
+    page.acknowledge(1 << 31, 1)  # no frame that it got
     await asyncio.sleep(1.0)  # one is requested once a second
+    assert not any(request.get("keyframe") for request in robot.requests)
     count = len(page.frames)
     page.what = 1
     await until(lambda: any(request.get("keyframe") for request in robot.requests))

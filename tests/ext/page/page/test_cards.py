@@ -141,7 +141,7 @@ def test_a_form_is_sent_once_the_browser_finds_no_mistake_and_what_it_refuses_is
         assert server.sent("autonomy") == []
 
 
-def test_what_was_asked_is_shown_until_the_outlet_reports_it(show: Show, server: CannedServer) -> None:
+def test_what_was_asked_is_shown_until_the_outlet_reports_anything_new(show: Show, server: CannedServer) -> None:
     metric, report = "outlets/o2/status", outlet("o2")
     state = replace(STATES["devices"], values=changed(devices, lambda _now: (GOOB, metric, report, 0.0)))
     with show(replace(state, repeated={metric: 0.1})) as opened:
@@ -152,7 +152,13 @@ def test_what_was_asked_is_shown_until_the_outlet_reports_it(show: Show, server:
         report["value"]["on"] = True
         assert opened.until(lambda: opened.test("outlet-o2").get_attribute("aria-checked") == "true")
         assert opened.test("outlet-asked-o2").count() == 0
-        assert [one["on"] for one in server.sent("outlet")] == [True]
+        report["value"]["on"] = None
+        assert opened.until(lambda: opened.test("outlet-state-o2").inner_text() == "unknown")
+        do(opened, "outlet-o2")
+        assert opened.test("outlet-asked-o2").inner_text() == "asked: on"
+        report["value"]["on"] = False  # another operator was faster
+        assert opened.until(lambda: opened.test("outlet-asked-o2").count() == 0)
+        assert [one["on"] for one in server.sent("outlet")] == [True, True]
 
 
 def test_stops_are_read_aloud_whatever_comes_right_after_them(show: Show) -> None:
