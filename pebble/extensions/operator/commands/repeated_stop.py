@@ -147,7 +147,9 @@ class _OtherRobots:
             if self._heartbeats is not None:
                 self._due = now + _OTHERS_S
             return
-        addresses = (parse_topic(message.topic) for message in self._heartbeats.take() if not message.retain)
+        messages = self._heartbeats.take()
+        threading.Thread(target=self._heartbeats.close, daemon=True).start()  # on a thin link no stop waits for more
+        addresses = (parse_topic(message.topic) for message in messages if not message.retain)
         robots = {address.identity for address in addresses if address is not None and not address.identity.is_server}
         if robots and not any(robot.base in self._sender.robots for robot in robots):
             name, names = id_of(next(iter(self._sender.robots))), sorted(id_of(robot.base) for robot in robots)
