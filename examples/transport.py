@@ -28,8 +28,8 @@ class Datagrams(Transport):
         self._socket.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, socket.inet_aton(self._group[0]) + here)
         self._socket.bind(self._group)
         threading.Thread(target=self._receive, daemon=True).start()
-        self._renew()  # of subscriptions, before the first message is offered
-        self._initial_sync(())  # sends all retained messages, as no other end stores any; the state is CONNECTED then
+        self._renew()  # its subscriptions now belong to a new connection; before the first message is offered
+        self._initial_sync(())  # (): no other end stores any, so all retained messages are sent; then it is CONNECTED
 
     def _close(self, will: Message | None) -> None:
         with suppress(OSError):

@@ -342,7 +342,7 @@ def packages() -> Iterator[Extension]:
             yield extension
         except KeyboardInterrupt:
             raise
-        except BaseException as error:  # noqa: BLE001 - as in named()
+        except BaseException as error:  # noqa: BLE001 - a module of others may raise anything, also SystemExit
             log.error("the extension %s cannot be loaded: %s", name, _reason(error))
 
 
@@ -437,7 +437,9 @@ def _of_file(path: Path) -> Extension:
     if not path.is_file():
         raise PebbleError(f"there is no file {path}")
     is_root = hasattr(os, "getuid") and os.getuid() == 0
-    uid = (path.stat().st_uid or owner_of(path, nameless=False).uid) if is_root else 0  # who can change it; 0: root
+    uid = 0
+    if is_root:  # root runs only what root alone can change
+        uid = path.stat().st_uid or owner_of(path, nameless=False).uid  # who can change it; 0: root
     if uid:
         why = "and root runs no code of other users: chown root it, in a folder of root's"
         raise PebbleError(f"{path} belongs to user {uid}, {why}")

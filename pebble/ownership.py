@@ -153,8 +153,8 @@ def _rights_of(owner: Owner) -> tuple[Owner, list[int]]:
     """Return the user with a group (``owner``'s if the user is in it, else the primary), and all the user's groups."""
     import pwd  # which Windows lacks
 
-    with suppress(KeyError):  # a user without an entry has no groups
+    with suppress(KeyError):  # the user has no entry
         user = pwd.getpwuid(owner.uid)
         groups = os.getgrouplist(user.pw_name, user.pw_gid)
         return Owner(owner.uid, owner.gid if owner.gid in groups else user.pw_gid), groups
-    return Owner(owner.uid, owner.uid), [owner.uid]
+    return Owner(owner.uid, owner.uid), [owner.uid]  # without an entry: the user's number stands for the only group

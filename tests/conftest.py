@@ -55,9 +55,10 @@ _ENDING_S = 5.0  # for processes that are about to end
 
 #: Folders and modules of tests that check no times.
 _COMPUTING = (
-    *("commands/", "config/", "contract/", "core/test_extensions", "ext/checks/test_check.", "ext/install/setup/"),
-    *("ext/media/", "ext/page/modules/", "ext/recordings/exports/", "ext/recordings/files/", "ext/recordings/seek/"),
-    *("ext/recordings/test_unread", "ext/recordings/traffic/", "ext/scripts/perception/", "motion/"),
+    *("commands/", "config/", "contract/", "core/test_extensions", "ext/checks/test_check.", "ext/media/"),
+    *("ext/install/setup/test_steps.", "ext/page/modules/", "ext/recordings/exports/", "ext/recordings/files/"),
+    *("ext/recordings/seek/", "ext/recordings/test_unread", "ext/recordings/traffic/", "ext/scripts/perception/"),
+    "motion/",
 )
 #: Modules that take longest begin first: begun last, one of them would delay the end of the run.
 _LONG = (
@@ -74,7 +75,8 @@ _LONG = (
         "transports/test_mqtt.py",
         "ext/recordings/recorder",
     ),
-    *("ext/page/test_types.py", "firmware/test_deadman_virtual.py", "motion/test_motion.py"),
+    *("robot/test_lockstep.py", "firmware/test_heap.py", "ext/page/test_types.py"),
+    *("firmware/test_deadman_virtual.py", "motion/test_motion.py"),
 )
 
 

@@ -27,9 +27,12 @@ NAME = re.compile(r"^[a-z0-9][a-z0-9._-]*(?===)", re.MULTILINE)
 
 
 def compiled(*words: str) -> str:
-    """Return the packages that uv chooses; ends the program if it cannot."""
+    """Return the packages that uv chooses for ``words``: its arguments, such as files of requirements and options.
+
+    The argument ``-`` stands for what builds the wheel. Ends the program if uv cannot choose.
+    """
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    builds = "\n".join(project["build-system"]["requires"])  # read where ``words`` has a dash
+    builds = "\n".join(project["build-system"]["requires"])  # uv's input, read for the argument "-"
     command = [sys.executable, "-m", "uv", "pip", "compile", "--no-config", "--quiet", "--universal"]
     command += ["--python-version", "3.11", "--no-header", "--no-annotate"]
     command += ["--no-emit-package", "colorama"]  # of packages that also run on Windows
@@ -44,11 +47,11 @@ def main() -> None:
     upgrade = ["--upgrade"] if "--upgrade" in sys.argv[1:] else []
     compiled("pyproject.toml", "-", *EVERYTHING, "--generate-hashes", "--output-file", str(LOCK), *upgrade)
     text = LOCK.read_text()
-    within = ("--constraint", str(LOCK))
-    kinds = {
-        kind: set(NAME.findall(compiled("pyproject.toml", "-", *within, *(f"--extra={extra}" for extra in extras))))
-        for kind, extras in KINDS.items()
-    }
+    within = ("--constraint", str(LOCK))  # the versions that were chosen above
+    kinds: dict[str, set[str]] = {}  # by kind of installation: the names of its packages
+    for kind, extras in KINDS.items():
+        options = [f"--extra={extra}" for extra in extras]
+        kinds[kind] = set(NAME.findall(compiled("pyproject.toml", "-", *within, *options)))
     kinds[TOOLS] = set(NAME.findall(compiled("--group", TOOLS, *within)))
     packages = re.split(r"^(?=[a-z0-9])", text, flags=re.MULTILINE)
     for number, package in enumerate(packages):

@@ -156,7 +156,9 @@ def forked(work: Callable[[], object], seconds: float | None = None) -> bool:
     ctypes.CDLL(None).prctl(36, 1)  # PR_SET_CHILD_SUBREAPER: a process whose parent ends becomes a child of this one
     others = set(children())
     try:
-        pid = os.fork() or run_and_exit(work)  # it is 0 in the child, which never returns from there
+        pid = os.fork()
+        if pid == 0:  # the child
+            run_and_exit(work)  # never returns
         descriptor = os.pidfd_open(pid)
         ended, _, _ = select.select([descriptor], [], [], seconds)
         os.close(descriptor)
@@ -267,9 +269,9 @@ class Trial:
         seconds_of = {name: seconds for name, (seconds, _) in passed.items()}
         # rows of a module stay together, as they share what they set up
         names = sorted(passed, key=lambda name: (self.slowest[module_of[name]], seconds_of[name]))
-        self.rows = {name: passed[name] for name in names}
+        self.rows = {name: passed[name] for name in names}  # in the order of running; each: its seconds, and its arcs
         self.lines = {name: lines_of(arcs) for name, (_, arcs) in self.rows.items()}
-        self.failing = FAILED.findall(self.failed.read_text())
+        self.failing = FAILED.findall(self.failed.read_text())  # rows that fail without a mutant, too
         print(f"{len(names)} rows pass without a mutant; left out, as they fail: {', '.join(self.failing) or 'none'}")
         if not names:
             pytest.exit("no row passes without a mutant", 2)
@@ -277,7 +279,7 @@ class Trial:
             self.write_arcs()
 
     def write_arcs(self) -> None:
-        """Write which test functions cover each arc, for --spare."""
+        """Write which test functions cover each arc. By this --spare, in a later run, finds tests that may go."""
         covering: defaultdict[tuple[str, int, int], set[str]] = defaultdict(set)
         for name, (_, arcs) in self.rows.items():
             for arc in arcs:
@@ -310,18 +312,19 @@ class Trial:
     def attempt(self, record: dict[str, Any], reached_by: set[tuple[str, int]], text: bytes) -> dict[str, Any]:
         """Run rows with a mutant; write the result, and return it."""
         start, file = time.monotonic(), record["file"]
-        script = file.endswith(".js")
+        is_script = file.endswith(".js")  # a page module: the tests read it from the tree, no function is exchanged
         # Functions whose code a fork can exchange; none if the line runs while tests are imported. Without any, all
         # rows run with the changed file instead.
-        swaps = [] if script or reached_by & self.imported else self.swaps(file, text)
+        swaps = [] if is_script or reached_by & self.imported else self.swaps(file, text)
         names = [name for name in self.rows if not swaps or reached_by & self.lines[name]]
         seconds = sum(self.rows[name][0] for name in names)  # which they took without a mutant
         # a row may now have to set up what its module shares: at most what the module's slowest row took
-        seconds += sum(self.slowest[path] for path in {self.items[name].path for name in names})
+        modules = {self.items[name].path for name in names}
+        seconds += sum(self.slowest[module] for module in modules)
         self.failed.write_text("")
-        if script:
+        if is_script:
             (self.tree / file).write_bytes(text)
-        in_fork = swaps or script
+        in_fork = swaps or is_script
         work = (lambda: self.run_swapped(swaps, names)) if in_fork else (lambda: self.run_new(file, text))
         result = "not reached"
         if names:
@@ -353,11 +356,11 @@ class Trial:
         return len(self.run_rows(names, stop=not self.options.matrix)) == len(names)
 
     def run_new(self, file: str, text: bytes) -> None:
-        """Run all rows with a changed file in a new process, where pytest writes which fail."""
+        """Run all rows but ``failing`` with a changed file, in a new process where pytest writes which fail."""
         (self.tree / file).write_bytes(text)
         os.utime(self.tree / file, (0, 0))  # so that no .pyc file is taken for it
         os.dup2(os.open(self.failed, os.O_WRONLY), 1)
-        options = ["--tb=no", "-rfE", f"--maxfail={int(not self.options.matrix)}"]  # 0: no limit
+        options = ["--tb=no", "-rfE", f"--maxfail={int(not self.options.matrix)}"]  # 0: no limit, find all killers
         options += [f"--deselect={name}" for name in self.failing]
         os.execv(sys.executable, [sys.executable, "-m", "pytest", *options, *self.arguments])  # noqa: S606
 

@@ -86,7 +86,7 @@ class SenderClocks(Generic[K]):
                 clock = self._clock_to_use(key, clock, sent, now, late_s)
             if waited_s <= late_s:
                 clock.proved = max(clock.proved, now - sent - waited_s)
-            # The difference without delay is between `proved` and `least`. The smaller errs towards a longer age.
+            # Without delay the difference is at least `proved`, at most `least`. The smaller errs towards a longer age.
             age = now - sent - min(clock.least, clock.proved)
             return age if now - clock.began >= _YOUNG_S else max(age, waited_s)
 
@@ -119,7 +119,7 @@ class SenderClocks(Generic[K]):
             return clock
         candidate, patience = clock.other, self._patience  # the candidate: the sender's clock, if it was set
         patience_s = patience.set_back_s if sent < clock.newest - _JUMP_S else patience.believed_s
-        # A new candidate begins if there was none, after a pause, or as soon as the stamps go back (less patience).
+        # A new candidate begins if there was none, after a pause, or once the stamps go back and so need less patience.
         if candidate is None or now - candidate.received_at > patience.gap_s or patience_s < candidate.patience_s:
             clock.other = _Clock(sent, now, patience_s)
             return clock

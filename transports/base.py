@@ -30,8 +30,8 @@ log = logging.getLogger(__name__)
 QUEUE_LIMIT = 1000  # messages waiting for a slow handler before the oldest is dropped
 QUEUE_BYTES = 16 << 20  # the same, for their topics and payloads
 _MATCHED = 512  # topics whose subscriptions are remembered
-_DELIVERED_TOPICS_LIMIT = 65_536  # topics a subscription remembers as delivered, per connection
-_DELIVERED_TOPICS_BYTES = 4 << 20
+_DELIVERED_TOPICS_LIMIT = 65_536  # topics a subscription remembers as delivered, per connection; see `offer`
+_DELIVERED_TOPICS_BYTES = 4 << 20  # of these topics; a value is None, and counts 0
 _HANDLER_END_S = 1.0  # how long closing waits for handlers that are running
 _TRIED_S = 0.02  # how soon `open` notices that all addresses were tried
 _NAMED = 3  # subscriptions in one line
@@ -107,7 +107,7 @@ class Subscription:
         with self._lock:
             if self._closed:
                 return
-            if not transport.as_published:
+            if not transport.as_published:  # then the flag marks old messages
                 repeat = message.retain and not transport.policy.delivers_late
             if not self._delivered_topics.has(message.topic):
                 self._delivered_topics[message.topic] = None
@@ -387,7 +387,7 @@ class Transport(ABC):
                 self._count_sent()
             else:  # "parked" is the published name of the counter of pending messages
                 self.counters.add("parked" if stored else "refused")
-            return accepted or stored
+            return accepted or stored  # stored by `remember`: it is sent once the connection is back
 
     def subscribe(
         self,

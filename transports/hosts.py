@@ -107,7 +107,7 @@ class AddressRound:
         return HANDSHAKE_S if self._left and self._left[0] in self._slow else CONNECT_TIMEOUT_S
 
     def opened(self, seconds: float) -> None:
-        """Note how long TCP and TLS took. If that was short, no address counts as slow any more."""
+        """Note how long TCP and TLS took. If that was short, the way is fast: no address counts as slow any more."""
         self._slow = {self._left[0]} if seconds > CONNECT_TIMEOUT_S else set()
 
     def was_slow(self) -> None:

@@ -171,7 +171,7 @@ class PeerRegistry:
         return {name: owner for name, owner in self._running().items() if owner and name != but}
 
     def _running(self) -> dict[str, str]:
-        owners = {}
+        owners = {}  # by the name of a process that runs: its ``owner``, "" until it is ready
         with suppress(FileNotFoundError):  # nothing was ever opened there
             for name in os.listdir(self._run_dir):  # noqa: PTH208  (a glob takes 300 KB for its patterns)
                 path = self._run_dir / name
@@ -210,9 +210,9 @@ def _owner_if_running(path: Path) -> str | None:
         return None
     try:
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError:  # it runs; or there are no locks here, and nothing of it may be removed
+    except OSError:  # it runs; or locks do not work here, so it may run, and nothing of it may be removed
         text = os.pread(descriptor, _OWNER_BYTES, 0)
-        return (text.strip(b"\0") or b"?").decode(errors="replace") if text else ""  # ?: only zeros, by a full disk
+        return (text.strip(b"\0") or b"?").decode(errors="replace") if text else ""  # ?: a full disk left zeros
     else:
         if _is_at(path, descriptor):  # else it was removed, and a new process may have the name
             _clear_socket(path.with_suffix(".sock"))

@@ -21,7 +21,7 @@ def _remove_if_unused(segment: Path) -> bool:
         return False
     try:
         status = os.fstat(descriptor)
-        if status.st_uid != os.geteuid() or time.time() - status.st_ctime < YOUNG_S:
+        if status.st_uid != os.geteuid() or time.time() - status.st_ctime < YOUNG_S:  # another's, or not locked yet
             return False
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         segment.unlink(missing_ok=True)

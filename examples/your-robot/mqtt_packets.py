@@ -44,7 +44,7 @@ class Reader:
     def __init__(self):
         self.data = b""
         self.skipped = 0  # bytes of a long packet that are still to come
-        self.head = b""  # what comes before the rest of the data, once these are skipped
+        self.head = b""  # what comes before the rest of the data, once those bytes are gone
 
     def add(self, data):
         self.data += data
@@ -69,7 +69,7 @@ class Reader:
         self.skipped -= gone
         self.data = self.data[gone:]
         if self.skipped == 0:
-            self.data = self.head + self.data  # a head is there only after a long topic, see below
+            self.data = self.head + self.data  # a head is there only after skip_long_topic
             self.head = b""
         return self.skipped == 0
 

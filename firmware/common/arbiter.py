@@ -60,7 +60,7 @@ class Arbiter:
             run = PERSON
         if lease.refuses(moves, run != PERSON or local, key, "" if local else by, now):  # scripts here need no key
             return REFUSED
-        ours = run != PERSON or not lease.key or lease.holds(key, by)  # no other client has control
+        ours = run != PERSON or not lease.key or lease.holds(key, by)  # a script's, or no other client has control
         if newer(run, self.barred) and run != self._newest:  # it has begun, even if this command is refused
             self._newest = run
             self.bar(run - 1 or LAST_RUN)

@@ -25,8 +25,9 @@ def describe(epoch_ms: int, root: bytes, name: str, stops, charging: bytes, axes
     """
     can, cannot = b"true", b"false"
     named = b',"name":' + json.dumps(name).encode() if name else b""
+    # in the order of their places in the template
     values = [epoch_ms, groups + (b'"named":true,' if stops.names else b"")] + root.split(b"/")
     values += [named, axes, can if stops.controllable else cannot, root, can if stops.stoppable else cannot]
     values += [root, root, root, charging, root, root]
-    # in the order of the template; what follows are the seven from video to git_pull, which no board offers
+    # last the seven places from video to git_pull, which no board offers
     return _CAPABILITIES % tuple(values + [b'{"available":false,"controls":false}'] * 7)

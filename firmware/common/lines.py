@@ -78,7 +78,7 @@ class Lines:
         letter = line[at]
         if 97 <= letter <= 122:  # a..z, made A..Z
             letter -= 32
-        wanted = 2 if letter == 77 else 3 if letter == 76 else 4 if letter == 70 else 0  # M, L, F
+        wanted = 2 if letter == 77 else 3 if letter == 76 else 4 if letter == 70 else 0  # values of M, L, F; 0: unknown
         if not wanted:
             self.put(b"ERR unknown command")
             return

@@ -118,7 +118,10 @@ def _axis(body: dict, name: str) -> float:
 
 
 def _number(text: str) -> float:
-    """Return the number in ``text``; 0 if Linux robots see none: a board's float() also accepts 1_0, "." and "e5"."""
+    """Return the number in ``text``; 0 if Linux robots do not read it as a number.
+
+    float() of a board does not decide that: it also accepts 1_0, "." and "e5".
+    """
     if "nan" in text or "inf" in text:  # refused, as `_axis` refuses them as numbers
         raise ValueError
     if text.strip("0123456789+-.e") or not text.split("e")[0].strip("+-."):  # another letter, or no digit before e

@@ -20,7 +20,7 @@ class Gears:
         if linear > abs(turn):
             self._ahead_at = now
         elif linear < 0.0:
-            # less than 0: days ago, as the ticks wrap
+            # A difference less than 0: it drove ahead days ago, and the ticks have wrapped since.
             blocked = self._ahead_at is not None and 0 <= diff(now, self._ahead_at) < _BLOCK_MS
             linear = 0.0 if blocked else linear * _REVERSE_TRIM
         return clamp((linear + turn) * _LEFT_TRIM, -1.0), clamp(linear - turn, -1.0)

@@ -39,12 +39,12 @@ class Imu:
     def __init__(self, device, log) -> None:
         self.values = [0] * 9
         self.bias = [0] * 3
-        self.good = self.failed = self.calibrated = 0
+        self.good = self.failed = self.calibrated = 0  # good, failed: readings of the sensor
         self._device, self._log = device, log
         self._data = bytearray(14)
         self._skip = 0  # samples after power on that were skipped
         self._first = self._sums = self.bias  # `_learn` makes both lists; an existing one saves 100 bytes until then
-        self._working = False
+        self._working = False  # it was started, and has not failed _FAILURES times in a row since
         self._in_a_row = 0  # failures
         self._retry_at: int | None = None
         self._read_at: int | None = None
@@ -131,7 +131,7 @@ class Imu:
         if not ax and not across:
             return  # free fall: no direction of gravity
         roll, pitch = atan2(ay, az) * _CENTI_DEG, atan2(-ax, across) * _CENTI_DEG
-        if ms < _GAP_MS:
+        if ms < _GAP_MS:  # a complementary filter: the last attitude and its turn, corrected a little by gravity
             turned = self._roll + values[3] * ms / 1000
             roll = turned + _around(roll - turned) * _GRAVITY
             turned = self._pitch + values[4] * ms / 1000

@@ -37,7 +37,10 @@ class Clock:
             self._close(add(now, _RETRY_MS))
 
     def _ask(self, now: int, age: int, server: str) -> None:
-        """Look up the server's name, then request the time from it. ``age``: since the present query was due."""
+        """Look up the server's name, then request the time from it.
+
+        ``age``: ms since the present query was due, the lookup or the request; below 0: it is not due yet.
+        """
         if not self._open:
             if age >= 0:
                 self._due = now
@@ -45,7 +48,7 @@ class Clock:
         elif self._nonce:
             epoch = sntp.epoch_ms(self._open.step(now), self._nonce)
             if epoch is not None:
-                self._wall.set(epoch + age // 2, now)
+                self._wall.set(epoch + age // 2, now)  # the answer took half of the round trip
                 self._close(add(now, _AGAIN_MS))
             elif age >= _WAIT_MS:
                 self._close(add(now, _RETRY_MS))

@@ -54,7 +54,7 @@ class Client:
         """
         data = self.data
         self._end += count
-        # Nothing is read while what is sent waits for room in ``out``. 6: an answer, and a ping.
+        # Nothing is read while ``_more``, which is to be sent, waits for room in ``out``. 6: an answer, and a ping.
         while not self._more and len(self.out) - self.waiting > 6:
             skipped = min(self._skip, self._end - self._at)
             self._skip -= skipped
@@ -74,7 +74,7 @@ class Client:
             if stop > self._end and self._end - start < len(data):  # incomplete, and there is room for more of it
                 return ""
             self._at = min(stop, self._end)
-            self._skip = stop - self._at  # of one that is too long
+            self._skip = stop - self._at  # the rest of a packet that is too long
             first = data[start]
             if first >> 4 == 3:
                 self._publication(first, at + 1, stop)
@@ -96,7 +96,8 @@ class Client:
     def _publication(self, first: int, at: int, stop: int) -> None:
         """Acknowledge a publication, even one too long to be stored: else the broker holds back the next ones."""
         data = self.data
-        # where the topic ends, and where the payload begins; ``_end`` is the end of what was received
+        # ``topic`` is where the topic ends: beyond ``stop``, and so refused below, if not even its length is there.
+        # ``body`` is where the payload begins, ``_end`` the end of what was received.
         topic = at + 2 + (data[at] << 8 | data[at + 1]) if stop - at > 1 else stop + 1
         body = topic + (first & 6)  # QoS 1 sets the bit of 2, and puts a packet id of 2 bytes before it
         if first & 4 or body > stop or body > self._end:  # QoS above 1, or cut off
@@ -139,7 +140,7 @@ class Client:
             return False
         self._more.append(bytes((first, length)) if length < 128 else bytes((first, length & 127 | 128, length >> 7)))
         self._more.extend(parts)
-        self.sent(0)
+        self.sent(0)  # nothing was sent: this only fills ``out``
         return True
 
     def subscribe(self, count: int) -> None:

@@ -57,7 +57,7 @@ class NetworkRobot:
         if hasattr(body, "groups"):
             topics += (b"group",)
         plain = len(topics)  # how many of them, from the first on, are subscribed to without an account
-        if names:  # clients without one may stop, and send zeros; those that may drive may also have control
+        if names:  # without an account: stops and zeros; control, too, if strangers may drive
             plain = _DRIVE + 1 if strangers == 2 else _CONTROL + 1  # 2: strangers may not drive
         self.session = Session(settings, root, topics, plain, names, wrap, self._take)
         self.stops = EmergencyStop(now, _DRIVE_LIMIT_MS, strangers, names)
@@ -117,7 +117,7 @@ class NetworkRobot:
         self._void = False
         now = time.ticks_ms()
         self.session.read(now)
-        self.stops.save()  # now: a stop, or a reset, leaves the motors off
+        self.stops.save()  # takes a while, but writes only after a stop or a reset: then the motors are off
         if self._next and not self._void and not self.stops.lease.halts:
             if self.body.drive(*self._next[:3]):  # x, z, y
                 self.deadman.limit_ms = self._limit_ms
@@ -132,9 +132,9 @@ class NetworkRobot:
         if kind == "subscribed":
             results = bytes(raw)  # in the order of Client.subscribe: topics without an account come first
             granted = results[-len(client.topics) :]  # of all topics, with an account if names are checked
-            if granted[_DRIVE] > 127:
+            if granted[_DRIVE] > 127:  # 128 is a refusal (3.9.3)
                 raise ValueError("subscription refused")
-            # A stop counts without an account, too: its topic without one is among the first.
+            # A stop counts without an account, too: the result for its topic without one is the first of all.
             self.stops.stoppable = results[_ESTOP] <= 127 and granted[_RESET] <= 127
             self.stops.controllable = granted[_CONTROL] <= 127
             # The last one is the topic of groups, unless the body takes none: then it has no ``groups`` either.
@@ -144,7 +144,7 @@ class NetworkRobot:
         elif client.retained:  # stale
             self.refused += 1
         else:
-            self._obey(raw if kind == "publication" else None, now)  # else "too long"
+            self._obey(raw if kind == "publication" else None, now)  # None: it is "too long"
 
     def _obey(self, raw: memoryview | None, now: int) -> None:
         """Obey a command. ``raw`` None: the payload is too long."""

@@ -152,7 +152,7 @@ def _run(arguments: list[str]) -> int:
         code = application(arguments).main(arguments, prog_name="pebble", standalone_mode=False)
     except typer.TyperException as error:  # of a wrong command line
         context, message = getattr(error, "ctx", None), error.format_message().rstrip(".")
-        if context is not None and message == "Missing command":  # `pebble fleet` alone asks what there is
+        if context is not None and message == "Missing command":  # of a group, as `pebble fleet`: show what it has
             typer.echo(context.get_help())
             return 0
         from pebble.config.secret_text import without_secrets  # of use to errors only

@@ -159,7 +159,7 @@ def _config(
     file_class, config_class, rules = _classes(installed)
     reader = Reader(folder, env, rules, notes, file=path, other_forms=True)
     merged = with_instances(written)
-    ignored_keys = extensions.keys_of_missing(installed)  # of ours that are not in ``installed``: no class has them
+    ignored_keys = extensions.keys_of_missing(installed)  # of our other extensions: file_class lacks these keys
     if core_only:
         ignored_keys += [key for extension in available for key in extension.sections]
     root = reader.section(file_class, without(merged, ignored_keys))
@@ -167,7 +167,7 @@ def _config(
     if path is not None and holds_secret(written):
         warn_if_readable(notes, (), path, "it, and there is a password in it")
     if notes.problems:
-        # Missing extensions come first, even those that are only warnings: unknown sections may be theirs. Each once.
+        # Missing extensions first, even those that are only warnings: unknown sections may be theirs. None comes twice.
         raise ConfigError(list(dict.fromkeys(map(str, (*about_missing, *notes.problems)))))
     identity = Identity(root.robot.system, root.robot.type, root.robot.id)
     config: Config = config_class(
@@ -209,7 +209,7 @@ def _extensions(written: Any, folder: Path) -> tuple[tuple[Extension, ...], tupl
     named, missing = extensions.named(drives, folder, Section)
     installed = (*extensions.ours(), *named)
     # What the core has is declared as an extension too, so that no other may add a section or protocol of its names.
-    taken = [*dir(Config), *(f"services.{name}" for name in dir(Services))]  # keys, and names of methods
+    taken = [*dir(Config), *(f"services.{name}" for name in dir(Services))]  # of keys, and of methods too
     protocols = {name: SERIAL_PROTOCOLS[name] for name in OF_CORE}
     core = Extension(name="core", package="Pebble", sections=dict.fromkeys(taken, ""), protocols=protocols)
     extensions.refuse_claims(core, installed)
@@ -319,7 +319,7 @@ def resolved(config: Config) -> dict[str, Any]:
 
     Keys that are not set and have no default are left out; secrets and the values of variables read ``***``.
     """
-    not_in_file = {*Config.__struct_fields__} - {*Root.__struct_fields__}
+    not_in_file = {*Config.__struct_fields__} - {*Root.__struct_fields__}  # extensions' keys are in neither, and stay
     names = [name for name in config.__struct_fields__ if name not in not_in_file and name != "schema_"]
     keys = {name: masked(getattr(config, name), name) for name in names}
     return keys | {

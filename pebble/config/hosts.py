@@ -100,7 +100,7 @@ def split(text: str) -> UrlParts:
     """Split a URL, or ``[user@]host[:port]``, into its parts. Raises HostError."""
     if flaw := hidden(text):
         raise HostError(flaw)
-    if "://" not in text:
+    if "://" not in text:  # urlsplit finds a host behind // only, and an IPv6 address in brackets only
         text = f"//[{text}]" if text.count(":") > 1 and "[" not in text else f"//{text}"
     text = _with_zone(text)
     try:

@@ -43,14 +43,14 @@ def reading_of(annotation: Any, kind: Any, metas: list[Meta], raw: Any, default:
         return Reading(extra["unlike"])
     if raw and isinstance(raw, str) and not wants_number:  # a text that is no form of a value is a mistake
         return None
-    is_empty = not raw or (raw is True and not wants_number)  # as a number a mere true is a mistake
+    is_empty = not raw or (raw is True and not wants_number)  # where a number is wanted, true is a mistake
     means_default = number == 0 or (is_empty and "exact" not in extra)  # with "exact" only a 0 does
     if means_default and default is not NODEFAULT:
         return Reading(default)
     if not wants_number or number is None or "exact" in extra:
         return None
     for meta in metas:
-        if meta.gt is not None and number <= meta.gt:  # above such a limit no number is the nearest
+        if meta.gt is not None and number <= meta.gt:  # ``gt`` itself is not valid, so no valid number is the nearest
             return None if default is NODEFAULT else Reading(default)
         if meta.ge is not None:
             number = max(meta.ge, number)

@@ -56,7 +56,7 @@ def _unused(retired: list[Note]) -> Iterator[str]:
     """Yield lines such as ``video.{shm_size, io_mode}: no longer used, …``; many keys share one line."""
     reasons = dict.fromkeys(note.text for note in retired)
     if len(reasons) > _FEW_REASONS:
-        paths = (tuple(step for step in note.path if isinstance(step, str)) for note in retired)
+        paths = (tuple(step for step in note.path if isinstance(step, str)) for note in retired)  # no places in lists
         names = ", ".join(dict.fromkeys(show_path(path[-2:]) for path in paths))
         yield without_secrets(f"no longer used, delete them: {names}; `pebble check --keys` says what replaces each")
         return
@@ -67,7 +67,7 @@ def _unused(retired: list[Note]) -> Iterator[str]:
                 keys_of.setdefault(note.path[:-1], []).append(str(note.path[-1]))
         places = []
         for section, keys in keys_of.items():
-            listed = keys[0] if len(keys) == 1 else f"{{{', '.join(keys)}}}"
+            listed = keys[0] if len(keys) == 1 else f"{{{', '.join(keys)}}}"  # such as {shm_size, io_mode}
             places.append(show_path((*section, listed)))
         yield without_secrets(f"{', '.join(places)}: no longer used, {reason}")
 

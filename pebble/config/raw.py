@@ -89,13 +89,13 @@ def _is_words(path: problems.Path) -> bool:
 
 
 def deep_merge(under: Any, over: Any) -> Any:
-    """Return ``under`` updated by ``over``, objects key by key. An empty string or null changes nothing."""
+    """Return ``under`` updated by ``over``, objects key by key, over's keys first. "" and null change nothing."""
     if over is None or over == "":
         return under
     if not isinstance(under, dict) or not isinstance(over, dict):
         return over
     merged = {key: deep_merge(under.get(key), value) for key, value in over.items()}
-    return merged | {key: value for key, value in under.items() if key not in over}  # last: problems keep over's order
+    return merged | {key: value for key, value in under.items() if key not in over}  # problems come in this order
 
 
 def with_instances(raw: Any) -> Any:

@@ -67,7 +67,7 @@ class Reader:
         for written, value in pairs:
             key = self._key(kind, keys, written, (*path, written))
             field = keys.get(key)
-            if field is None or value in ("", None):  # `_key` has noted it; or it is not set, which "" and null mean
+            if field is None or value in ("", None):  # unknown, which `_key` has noted; or not set ("" or null)
                 continue
             if self._other_forms and value == [] and isinstance(field.default, tuple):  # for the original: unset
                 continue
@@ -149,13 +149,13 @@ class Reader:
         tells_nothing = shown == "text" and (get_origin(kind) is Literal or kind in (str, Path))
         must_be = f"must be {expected(kind, metas)}" + ("" if tells_nothing else f", not {shown}")
         reading = reading_of(annotation, kind, metas, raw, default) if self._other_forms else None
-        if reading is not None and reading.differs:  # another value, with a warning
+        if reading is not None and reading.differs:  # another value takes its place, with a warning
             is_set = bool(reading.value) or reading.value == 0  # 0 and false are values
             used = f"{msgspec.json.encode(reading.value).decode()} is used" if is_set else "it counts as not set"
             self.notes.warning(path, f"{must_be}; {used}")
             return reading.value
         is_raw = reading is not None and type(reading.value) is type(raw) and reading.value == raw
-        if reading is None or is_raw:  # there is nothing but raw, which would be refused again
+        if reading is None or is_raw:  # there is no other form of ``raw``, which would be refused again
             self.notes.problem(path, must_be)
             return _WRONG
         return self._scalar(annotation, reading.value, path, NODEFAULT)  # another form of a valid value

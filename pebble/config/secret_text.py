@@ -52,10 +52,10 @@ def without_secrets(text: str) -> str:
     """
     if _AT.search(text):
         text = re.sub(r"\S+", _without_login, _LOGIN_WITH_BLANKS.sub(rf"\1{HIDDEN}@", text))
-    text = _PAIR.sub(rf"\1{HIDDEN}", text) if "=" in text else text  # without "=" it finds none: this saves time
-    text = _OPTION.sub(rf"\1{HIDDEN}", text) if "-" in text else text  # the same
+    text = _PAIR.sub(rf"\1{HIDDEN}", text) if "=" in text else text  # only if it can match: to save time
+    text = _OPTION.sub(rf"\1{HIDDEN}", text) if "-" in text else text
     text = _HEADER.sub(rf"\1{HIDDEN}", text) if ":" in text else text
-    return _MEMBER.sub(rf"\1\2\3\4{HIDDEN}", text) if ":" in text else text  # one of the four groups is not empty
+    return _MEMBER.sub(rf"\1\2\3\4{HIDDEN}", text) if ":" in text else text  # a match has one of the groups
 
 
 def _without_login(match: re.Match[str]) -> str:
@@ -66,11 +66,11 @@ def _without_login(match: re.Match[str]) -> str:
         return word
     end = ats[-1]
     slashes = _SLASHES.search(word)
-    # The first colon with a password after it; the user name before it begins after a sign such as a quote.
+    # The first colon that does not end directly before the last @: what is between them is taken for the password.
     colon = next((colon for colon in _COLON.finditer(word, 0, end) if colon.end() < end), None)
     if slashes and slashes.end() <= end:  # SCHEME://LOGIN@
         start = slashes.end()
-    elif colon:  # NAME:PASSWORD@
+    elif colon:  # NAME:PASSWORD@; NAME begins after a sign such as a quote
         start = max((sign.end() for sign in _BEFORE_USER.finditer(word, 0, colon.start())), default=0)
     else:
         return word

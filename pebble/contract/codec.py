@@ -178,7 +178,7 @@ def _request(channel: Channel, request: Any) -> Any:
 
 
 def _drive(channel: Channel, command: dict[str, Any], remark: Remark) -> dict[str, Any]:
-    """Return a drive command's valid fields. Raises PayloadError if it moves, but one that decides on it is wrong."""
+    """Return a drive command's valid fields. Raises PayloadError if it moves and a field of _DRIVE_RULES is wrong."""
     axes = _numbers(channel, command, remark)
     if not axes:
         keys = ", ".join([_shown(key) for key in command][:_KEYS_SHOWN]) or "nothing"
@@ -193,7 +193,7 @@ def _drive(channel: Channel, command: dict[str, Any], remark: Remark) -> dict[st
         raise PayloadError(f"{channel.metric}: run is missing, which a script's command needs")
     if moves and "valid_ms" in given and given["valid_ms"] < 1:
         raise PayloadError(f"{channel.metric}: valid_ms is less than 1, so it moves nothing")
-    valid = {key: value for key, value in given.items() if key not in wrong}
+    valid = {key: value for key, value in given.items() if key not in wrong}  # a zero passes without wrong ones
     if "valid_ms" in valid:
         valid["valid_ms"] = int(valid["valid_ms"])
     others = {key: command[key] for key, fits in _OTHER_DRIVE_FIELDS.items() if fits(command.get(key))}
@@ -242,7 +242,7 @@ def _numbers(channel: Channel, command: dict[str, Any], remark: Remark) -> dict[
         if name in command:
             number = _number(channel, name, command[name])
             numbers[name] = default if number is None else number
-            if number is None and command[name] is not None:
+            if number is None and command[name] is not None:  # null is no mistake: it means the default
                 text = f"{name} is {_shown(command[name])}, which is no number: it counts as {default:g}"
                 remark(channel, _sender(command), text)
     return numbers

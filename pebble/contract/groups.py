@@ -36,7 +36,7 @@ def decode(raw: bytes) -> tuple[Member, ...]:
     """Return the members of a group. Raises PayloadError if a member is not allowed, or cannot be read."""
     if len(raw) > MOST_BYTES:
         raise PayloadError(f"{c.GROUP.metric}: {len(raw)} bytes, more than {MOST_BYTES}")
-    codec.plain(c.GROUP, raw)  # within the limits of all commands
+    codec.plain(c.GROUP, raw)  # for its errors alone: no JSON, or beyond the limits of all commands
     commands = _strict_json(codec.trim(raw))
     by = commands.pop(BY, None) if isinstance(commands, dict) else None
     if not isinstance(commands, dict) or not 1 <= len(commands) <= MOST_MEMBERS:
@@ -64,7 +64,7 @@ def _member(metric: str, command: Any, by: Any) -> Member:
 
 def _strict_json(text: bytes) -> Any:
     """Return the JSON value in ``text``. Raises PayloadError for an infinite number, or a key twice in any spelling."""
-    import json  # the only reader that shows it, and only robots with groups pay for it
+    import json  # no other reader shows a key that is there twice; only robots with groups pay for it
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         fields = dict(pairs)

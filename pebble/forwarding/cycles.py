@@ -110,7 +110,7 @@ class Cycles:
             is_suspicious = way.closed or count > usual or (never_probed and bool(self.closed_ways))
             can_be_probed = is_one_shot or len(payload) <= _LONGEST
             # Another bridge may have begun since the last probe: so the first suspicious message is probed at once.
-            is_due = now - way.probed_at >= period or count == usual + 1
+            is_due = now - way.probed_at >= period or count == usual + 1  # usual + 1: the first suspicious one
             return Finding.SUSPECT if is_suspicious and can_be_probed and is_due else Finding.PASS
 
     def _repeats_stop(self, side: Side, topic: str, payload: bytes) -> bool:

@@ -72,7 +72,7 @@ class Mirroring:
 
     def is_possible(self) -> bool:
         """True if no side sends our own messages back. Otherwise commands would be repeated, even after a stop."""
-        if all(state.transport.exact_echo for state in self._sides.values()):  # then echo=False is kept to
+        if all(state.transport.exact_echo for state in self._sides.values()):  # subscribe(echo=False) is exact
             return True
         if not self._was_refused:  # it is logged once
             self._was_refused = True
@@ -119,15 +119,15 @@ class Forwarder:
         )
         #: Results of :func:`route` by its arguments, see _route. There are few subjects, so no bound is needed.
         self._routes: dict[tuple[Side, Subject, QoS, bool, bool | None, bool], Forward | Drop] = {}
-        self._admission = Admission(clock)
-        self.ages = CommandAges()
-        self.cycles = Cycles(clock)
+        self._admission = Admission(clock)  # limits of size and number
+        self.ages = CommandAges()  # of commands, by the clocks of their senders
+        self.cycles = Cycles(clock)  # messages that something else brings back
         both_ways = frozenset(kind for kind in Kind if rules.both_ways(kind))
         self.publisher = Publisher(self.sides, self.cycles, subjects, self.counters, both_ways, stored=rules.stored)
         self.retained = RetainedTopics(self.sides, subjects, self.publisher, winner, both_ways, on_value)
         self._quiet_log = RateLimitedLog(log, period_s=60.0)
         self.mirroring = Mirroring(self.sides)
-        #: Publishes a message that is admitted, at once; an extension may put in its place what lets some wait.
+        #: Publishes an admitted message at once; an extension may replace it by a function that lets some of them wait.
         self.pass_on: Pass = self.pass_now
         #: Is told whether each drive command, and request for control, from outside was late.
         self.note_age: Callable[[bool], None] = lambda _late: None
@@ -178,10 +178,10 @@ class Forwarder:
     # -- the receiving threads
 
     def skips_retained(self, side: Side, topic: bytes) -> bool:
-        """True if retained messages of ``topic`` do not pass: then counts and logs the present one. For TopicPolicy."""
+        """True if a retained message of ``topic`` does not pass: then it is counted and logged. For TopicPolicy."""
         if self._names is not None and topic.endswith(_STOP) and self._is_stop(topic.decode(errors="replace")):
             return False  # it may be a live stop, with a name in its topic
-        kind = self.subjects.invented(topic)  # a flag or a command that the contract does not know
+        kind = self.subjects.invented(topic)  # FLAG or COMMAND if the contract does not know the topic; else None
         if kind is None or (kind is Kind.FLAG and not self._admission.refuses_flag(topic)):
             return False  # the contract knows it, or it is an unknown flag for which there is room
         drop = Drop.TOO_MANY if kind is Kind.FLAG else Drop.STALE  # a retained command
@@ -209,7 +209,7 @@ class Forwarder:
     def _receive_named(self, source: SideState, names: Names, message: Message) -> Routed:
         """Forward a message whose sender is checked: the name moves from the topic into the payload."""
         sender = names[message.topic]
-        subject, by = sender.subject, sender.account  # by: a Signed, below, adds the person for whom the account acts
+        subject, by = sender.subject, sender.account  # by: later as in Signed, with the person behind the account
         outcome = self.admit(source, subject, message, sender.topic, by != NO_ACCOUNT)  # notes foreign retained ones
         if subject is None:
             outcome = sender.foreign  # why the topic means nothing to this robot
@@ -219,7 +219,7 @@ class Forwarder:
                     outcome = self.retained.change(subject, signed)  # the topic without a name gets it on both sides
                 case Signed(signed, by):
                     outcome = self.pass_on(source, subject, signed, outcome, sender.account)
-                case Drop.UNNAMED if outcome.retain:  # perhaps the robot's own, as the remote broker has retained it
+                case Drop.UNNAMED if outcome.retain:  # retained: perhaps the robot's own, as the remote broker has it
                     outcome = self.retained.receive(source, subject, message, outcome, only_old=True)
                 case Drop() as drop:
                     outcome = drop
@@ -316,9 +316,9 @@ class Forwarder:
         """Return an admitted message as it may pass, or why not: it is too late, or a script elsewhere sent it."""
         if subject.kind.one_shot and self._is_late(subject, message, forward, account):
             return Drop.LATE
-        if not forward.unsigned:  # here signed commands pass, too
+        if not forward.unsigned:  # a command may also pass with a script's signature
             return message
-        return self._without_script(source, message) or Drop.SIGNED
+        return self._without_script(source, message) or Drop.SIGNED  # SIGNED: a script elsewhere would move the robot
 
     def _is_late(self, subject: Subject, message: Message, forward: Forward, account: str) -> bool:
         """True if a command or action has waited for too long, unless it only ends something."""
@@ -333,7 +333,7 @@ class Forwarder:
     def _without_script(self, source: SideState, message: Message) -> Message | None:
         """Return a drive command without a script's signature; None if a script's command would move the robot."""
         passing = unsigned(message.payload)
-        if passing is message.payload:
+        if passing is message.payload:  # it has no signature
             return message
         self._quiet_log.warning(Drop.SIGNED.name, "%s: %s", message.topic[:_LOGGED], Drop.SIGNED.value)
         if passing is None:
@@ -378,7 +378,7 @@ class Forwarder:
         if self.gate is Gate.SHUT:
             return Drop.CLOSED
         target.events.hold(message)
-        gate = self.sides.gate  # again: who opened or shut it meanwhile may have found the events without this one
+        gate = self.sides.gate  # read again: it may have been opened or shut just before this event was held
         if gate is Gate.OPEN:
             target.events.resume()
         elif gate is Gate.SHUT:

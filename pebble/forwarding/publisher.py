@@ -33,9 +33,9 @@ class Publisher:
 
     def publish(self, to: SideState, subject: Subject, message: Message, forward: Forward) -> None:
         topic, payload, transport = message.topic, message.payload, to.transport
-        if subject.runs or self._cycles.closed_ways:  # it must run only once, or some topic circulates
+        if subject.runs or self._cycles.closed_ways:  # what it starts must run only once, or some topic circulates
             self.note_return(to, subject, message)
-        echoing = not transport.exact_echo and subject.is_two_way
+        echoing = not transport.exact_echo and subject.is_two_way  # its own broker may send it back
         if echoing:
             to.loopback.expect(topic, payload)
         accepted = transport.publish(
@@ -55,7 +55,7 @@ class Publisher:
     def note_return(self, to: SideState, subject: Subject, message: Message) -> None:
         """Expect ``message``, published to one side, to come back on the other side, if its topic circulates.
 
-        One that runs something is expected even before a probe shows that; a drive command does not pass then.
+        What runs something is expected before a probe shows that it does; drive commands never: they do not pass then.
         """
         origin = to.side.other
         if subject.runs or (not subject.kind.one_shot and (origin, message.topic) in self._cycles.closed_ways):
@@ -64,12 +64,12 @@ class Publisher:
     def is_echo(self, source: SideState, subject: Subject, message: Message) -> bool:
         """True if ``message`` is ours, and came back by another bridge or from a broker without bridge mode.
 
-        Forgets it and all earlier messages of its topic.
+        Forgets it and all earlier messages of its topic. A retained echo is recognised elsewhere, by its value.
         """
         topic, payload = message.topic, message.payload
         if (source.side, topic) in self._cycles.closed_ways and source.returns.is_echo(topic, payload):
             return True
-        # The side's own broker may have sent it back. A retained echo is recognised elsewhere, by its value.
+        # Or it is from the side's own broker, which sends back only what is two-way, and with `exact_echo` nothing.
         if source.transport.exact_echo or message.retain or not subject.is_two_way:
             return False
         return source.loopback.is_echo(topic, payload)

@@ -101,7 +101,7 @@ class Reconciliation:
         # Topics on which nothing of the winner has arrived since its connection began:
         self._offered: set[str] = set()  # those that the winner seemed to lack: it was sent the loser's values
         self._newer: set[str] = set()  # changed by the loser after the winner's retained messages counted as received
-        self._synchronized = dict.fromkeys(Side, False)
+        self._synchronized = dict.fromkeys(Side, False)  # its retained messages count as received
         self._overtaken: set[str] = set()  # changed by the loser while the winner was away
 
     def has_synchronized(self, *sides: Side) -> bool:
@@ -170,11 +170,11 @@ class Reconciliation:
         if side is self._winner:
             self._overtaken.clear()  # the winner's values have come; for those that come late there is _newer
             for topic, payload in self._held.items():
-                self._set(topic, payload, side.other)
+                self._set(topic, payload, side.other)  # it is the loser's value
                 due.append((side, topic, payload))  # to the winner, which has none
             self._held.clear()
         released = {topic for _, topic, _ in due}
-        due += [
+        due += [  # and all other newest values that ``side`` lacks
             (side, topic, last.payload)
             for topic, last in self._last.items()
             if topic not in released and self._is_missing(side, topic, last)

@@ -54,7 +54,7 @@ class RetainedTopics:
                 self._publish(source.side.other, subject, message, forward)
                 return forward
             if gate is Gate.WAITING and source.side is Side.LOCAL:  # the remote side is subscribed to once it is open
-                if message.topic in self._waiting or len(self._waiting) < _MAX_WAITING:  # others are dropped
+                if message.topic in self._waiting or len(self._waiting) < _MAX_WAITING:  # else it is lost
                     self._waiting[message.topic] = subject, message, forward
                 return Drop.HELD
             return Drop.CLOSED
@@ -124,7 +124,7 @@ class RetainedTopics:
         """Return why a message of either side must not pass; None if it may. ``only_old``: no live message may pass."""
         side, topic, payload, transport = source.side, message.topic, message.payload, source.transport
         if message.retain and topic in source.seen and transport.policy.delivers_late and not transport.as_published:
-            return Drop.KNOWN  # it is old, as the flag means without as_published; what came before it is newer
+            return Drop.KNOWN  # without as_published, `retain` marks an old message: the one seen before is newer
         if len(source.seen) < _MAX_WAITING:
             source.seen.add(topic)
         retained = self._sides.gate is not Gate.SHUT and self._is_retained(source, message)  # shut: all count as live

@@ -24,7 +24,7 @@ class RetainedWindow:
     def __init__(self, transport: Transport, clock: Callable[[], float]) -> None:
         self._transport, self._clock = transport, clock
         self._subscribed_at = float("inf")
-        self._until = float("inf")  # when messages with the retain flag count as live ones again
+        self._until = float("inf")  # when messages with the retain flag count as live again; inf: not yet known
         self._stops_until = float("inf")  # the same for stops
         self._newest_at = float("-inf")  # of the messages that may be old
 
@@ -45,13 +45,13 @@ class RetainedWindow:
         self._stops_until = max(self._until, self._newest_at + INITIAL_SYNC_S)
 
     def note(self) -> None:
-        """Note a message with the retain flag. While such messages arrive, a stop may be an old one."""
-        now, until = self._clock(), self._stops_until  # _until stays: the end is put off for stops alone
+        """Note a message with the retain flag. While such messages arrive, a stop with the flag may be an old one."""
+        now, until = self._clock(), self._stops_until  # `_until`, the end for other messages, is not put off
         if now >= until:  # the window for stops is over
             return
         self._newest_at = now
         if until < float("inf"):  # the subscription is complete: so each message puts the end off
-            latest = self._subscribed_at + _RETAINED_STOPS_S  # it ends then, whatever still arrives
+            latest = self._subscribed_at + _RETAINED_STOPS_S  # when the window for stops ends in any case
             self._stops_until = min(max(now + INITIAL_SYNC_S, until), latest)
 
     def is_old_stop(self, message: Message) -> bool:

@@ -137,7 +137,7 @@ class ForwardingService(Service, ABC):
         self.unsubscribe(Side.REMOTE)
         self.forwarder.sides[Side.REMOTE].subscribing()
         receive = partial(self.receive_remote, self.epoch)
-        directions = (INCOMING,) if self.rules.leaves_robot else (INCOMING, OUTGOING)  # OUTGOING is only the robot's
+        directions = (INCOMING,) if self.rules.leaves_robot else (INCOMING, OUTGOING)  # outside only we send OUTGOING
         self.subscriptions[Side.REMOTE] = [
             self.remote.subscribe(filter_, receive, echo=False, direct=True)
             for filter_ in self.subjects.filters(*directions)
@@ -159,7 +159,7 @@ class ForwardingService(Service, ABC):
                 self.call_at(self.clock() + QUIET_S, synchronize)  # some brokers send them late
             elif side is Side.LOCAL or epoch == self.epoch:  # the remote side has not been lost meanwhile
                 self.forwarder.retained.synchronize(side)
-                # Only now, when a mirror of a wrong broker has stopped. After a loss of LOCAL only bridges probe again.
+                # Not before: a mirror at a wrong broker has stopped by now. After a loss of LOCAL only bridges probe.
                 if side is Side.REMOTE or self.rules.leaves_robot:  # leaves_robot: this is the bridge
                     self.forwarder.publisher.probe_commands(*self.probed_sides)
 

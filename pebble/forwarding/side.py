@@ -43,8 +43,8 @@ class SideState:
         self.restarted = False  # its connection was lost; the reconciliation does not know yet
         self._clock, self._wins = clock, wins
         self._lost_at = float("-inf")  # when its state was last another than connected; -inf: never
-        # This side's broker has restored older retained messages. On the side that does not win: it may have done so.
-        self._went_back = False  # again False once this side's retained messages have arrived
+        # On the side that wins: its broker has restored older retained messages. On the other side: it may have.
+        self._went_back = False  # False again once this side's retained messages have arrived
 
     @property
     def connected(self) -> bool:
@@ -62,8 +62,8 @@ class SideState:
             self.subscribing()  # the transport does so at the next connection
             self.restarted = True
             self._lost_at = self._clock()
-            # A broker that ended may restore a save. For the side that does not win this is enough, and is noted now:
-            # old messages may come before CONNECTED. The side that wins needs `went_back`, known at CONNECTED.
+            # A broker that ended may restore a save. On the side that does not win it counts as having done so, and
+            # at once: old messages may come before CONNECTED. The side that wins needs `went_back`, known at CONNECTED.
             self._went_back = not self._wins and self.transport.was_ended
         elif self._wins:
             self._went_back = self._was_brief and self.transport.went_back  # brief: see RESTORED_S

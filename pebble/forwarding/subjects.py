@@ -109,7 +109,7 @@ class Subjects(dict[str, Subject | None]):
             self._addresses = [Addresses(view_of(config, instance)) for instance in instances]
         self._between_robots = tuple(f"{self._base}/{family}" for family in BETWEEN_ROBOTS)
         self._incoming = f"{self._base}/{INCOMING}/".encode()
-        topics = (topic.encode() for topic in self.topics(*CHANNELS))  # those elsewhere keep their base: no metrics
+        topics = (topic.encode() for topic in self.topics(*CHANNELS))  # others than incoming stay whole: no metric
         self._known_metrics = frozenset(topic.removeprefix(self._incoming) for topic in topics)
 
     def __missing__(self, topic: str) -> Subject | None:
@@ -130,13 +130,13 @@ class Subjects(dict[str, Subject | None]):
     def filters(self, *directions: str) -> list[str]:
         """Return the filters for all topics of ``directions``; no two of them overlap."""
         families = [f"{self._base}/{direction}/#" for direction in directions]
-        renamed = (
+        topics = (  # renamed or not
             addresses[channel].topic
             for addresses in self._addresses
             for channel in CHANNELS
             if channel.direction in directions and not channel.is_pattern
         )
-        outside = (topic for topic in renamed if not any(matches(family, topic) for family in families))
+        outside = (topic for topic in topics if not any(matches(family, topic) for family in families))
         return [*families, *dict.fromkeys(outside)]
 
     def topics(self, *channels: Channel) -> list[str]:

@@ -72,7 +72,7 @@ class Driveable:
         self._mcus[program] = note
         if before is not None:
             is_same = replace(before, silent_ms=None) == replace(note, silent_ms=None)  # but for the silence
-            if is_same and _drives(before) == _drives(note):
+            if is_same and _drives(before) == _drives(note):  # nor does the silence change the judgement
                 return
         self._on_change()
 

@@ -32,12 +32,12 @@ class Features:
 
     def receive(self, program: str, note: Feature) -> None:
         """Handle a note of ``program``: remember it while it differs from :data:`_EXPECTED`."""
-        report = {(program, note.name)}  # a set of one: `_set` gets all reports that count now
-        is_as_expected = note.has == (note.name in _EXPECTED)
+        report = program, note.name
+        is_as_expected = note.has == (note.name in _EXPECTED)  # a robot has it, or lacks it, without any report
         if is_as_expected:
-            self._set(self._reports - report)
+            self._set(self._reports - {report})
         elif len(self._reports) < _MOST_REPORTS:
-            self._set(self._reports | report)
+            self._set(self._reports | {report})
 
     def ended(self, program: str) -> None:
         """Forget the reports of a program that has ended."""

@@ -92,7 +92,7 @@ def _run(program: Program) -> None:
     sys.argv = [program.module, *program.arguments]
     if ":" in program.module:  # module:function
         sys.exit(run(part(program.module)))
-    if not hasattr(sys.modules.get(program.module), "__path__"):  # no package, whose __main__ would run
+    if not hasattr(sys.modules.get(program.module), "__path__"):  # a module: of a package, run_module runs __main__
         sys.modules.pop(program.module, None)  # it was imported before the fork; python -m has it only as __main__
     runpy.run_module(program.module, run_name="__main__", alter_sys=True)
 

@@ -123,11 +123,11 @@ class Launcher:
 
     def _driveable_by(self, running: Collection[str]) -> Driveable:
         """Return the `Driveable` of the programs ``running``: of their motors, and of serial lines without motors."""
-        lines = {program_of(name): self._config.motor_owner(name) for name in self._config.serial_instances()}
-        by_extensions = {program: name for name, program in motors_of(self._config.installed, self._config).items()}
-        owners = [*map(program_of, self._config.motor_lines()), *by_extensions]
+        line_names = {program_of(name): self._config.motor_owner(name) for name in self._config.serial_instances()}
+        motor_names = {program: name for name, program in motors_of(self._config.installed, self._config).items()}
+        owners = [*map(program_of, self._config.motor_lines()), *motor_names]
         return Driveable(
-            {program: name for program, name in (lines | by_extensions).items() if program in running},  # lines
+            {program: name for program, name in (line_names | motor_names).items() if program in running},  # lines
             [program for program in owners if program in running],  # owners: with motors
             ["mqtt_bridge"] if "mqtt_bridge" in running else [],  # ways: through which drive commands come
             lambda: self._status.changed(),

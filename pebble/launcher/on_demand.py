@@ -22,8 +22,8 @@ class OnDemand:
     def __init__(self, reactor: Reactor, supervisors: Iterable[ProcessSupervisor]) -> None:
         self._reactor = reactor
         self._supervisors = {s.program.name: s for s in supervisors if s.program.on_demand}
-        self._wanted: dict[str, bool] = {}  # what the newest note says, by the requested program
-        self._held: dict[str, bool] = {}  # the same
+        self._wanted: dict[str, bool] = {}  # what the newest Wanted note says, by the requested program
+        self._held: dict[str, bool] = {}  # what the newest Held note says, by the program that it holds or frees
         self._encodings: dict[str, str] = {}  # with which a program begins, whenever it is started
         self._until: dict[str, float] = {}  # when a request expires whose sender has ended
         self._refused: set[str] = set()  # programs whose first refused note was logged

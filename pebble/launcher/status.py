@@ -120,7 +120,7 @@ class StatusPublisher:
         return Status(t=_now_ms(), value={"services": states, **{key: part for key, part in parts.items() if part}})
 
     def _state(self, supervisor: ProcessSupervisor) -> ServiceState:
-        policy = supervisor.policy
+        policy = supervisor.policy  # has the state in the words of the status, unlike supervisor.state
         return ServiceState(
             state="held" if supervisor.held else policy.state,
             restarts=policy.restarts,

@@ -37,8 +37,8 @@ class Control:
     ) -> None:
         """Store the arguments; ``owners``: all motor owners of the robot.
 
-        ``show_turn()`` must send the result of :meth:`turn` to the other owners. ``bridged``: a client counts as silent
-        only for the time for which the bridge vouches (:meth:`vouch`) that it passed on all messages, or after 30 s.
+        ``show_turn()`` must send the result of :meth:`turn` to the other owners. ``bridged``: a client's silence counts
+        only in periods for which the bridge vouches (:meth:`vouch`), as it passed on all messages; or after 30 s.
         """
         self.boot = secrets.token_hex(4)  # of this life of the motor owner
         self._named = security.named

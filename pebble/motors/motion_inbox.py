@@ -71,7 +71,7 @@ class MotionInbox:
         self._stops: list[p.EstopCommand] = []
         self._resets: list[ReceivedReset] = []
         self._requests: dict[tuple[str, str], ReceivedRequest] = {}  # by sender, the newest sender last
-        self._turns: dict[str, p.ControlTurn] = {}  # by owner: its newest grant of control, or which one it follows
+        self._turns: dict[str, p.ControlTurn] = {}  # by owner: a grant of the first one; which grant another follows
         self._lost = False  # messages, since the last batch
         self._vouched: p.ControlVouched | None = None  # the newest period that the bridge has vouched for
         self._drives: dict[int, list[ReceivedDrive]] = {}  # by run, PERSON or _HOLDER; the newest sender last

@@ -70,7 +70,7 @@ class MotorGuard:
         saved = self._file.load()
         if saved is not None:
             self._latch.restore(saved)
-            self._save()  # once more: what a process wrote that was killed meanwhile may not be on the disk yet
+            self._save()  # again: the process that wrote it may have been killed before it was on the disk
         barred = self._barred_file.load()
         if type(barred) is int and 0 < barred <= LAST_RUN:
             self._arbiter.bar(barred)

@@ -50,7 +50,7 @@ class MotorOwner(Service, ABC):
             self._show_turn,
             bridged=self.config.services.mqtt_bridge.enabled,
         )
-        self._waiting = MotionInbox(self._control)
+        self._waiting = MotionInbox(self._control)  # messages that are not judged yet
         self.state_file = StateFile(self.config.state_file(f"estop-{self.owner}"), self._on_saved)
         self._barred_file = StateFile(self.config.run_dir() / f"barred-{self.owner}.json")
         self._guard = MotorGuard(
@@ -65,10 +65,10 @@ class MotorOwner(Service, ABC):
         self.on_stop(self.state_file.close)  # first, so called after all that start() adds: a file may be slow
         self.on_stop(self._barred_file.close)
         self._deadline: Timer | None = None  # stops the motors unless a command arrives; None: they are stopped
-        self._guard_timer: Timer | None = None
+        self._guard_timer: Timer | None = None  # for the next tick of guard and control
         self.announced_latching = True  # operators were told that a stop latches here
-        self._estop_note = Reported(self.notifier.feature, "estop", True)
-        self._control_note = Reported(self.notifier.feature, "control", True)
+        self._estop_note = Reported(self.notifier.feature, "estop", True)  # to the launcher: a stop latches here
+        self._control_note = Reported(self.notifier.feature, "control", True)  # and requests for control are received
 
     @property
     @abstractmethod
@@ -292,7 +292,7 @@ class MotorOwner(Service, ABC):
         self._estop_note.report("estop", self.announced_latching)
 
     def _announce_latching(self) -> None:
-        if self.announced_latching:  # set by the caller: this is what is to be announced
+        if self.announced_latching:  # the caller has just set it: True is to be announced
             self.log.warning("the subscriptions to the emergency stop are granted again: a stop latches")
             self.repeat_state()
             return

@@ -90,7 +90,7 @@ class FollowingLease(SharedLease):
             holder = (turn.account, turn.id, turn.by, turn.device) if turn.key else ()  # a client, see Lease
             self.take(holder, 0, now)  # 0: the lease makes no key of its own
             self.key = turn.key
-        asker = ("", turn.asks_id, turn.asks, "") if turn.asks_id else ()  # a turn lacks its account and device
+        asker = ("", turn.asks_id, turn.asks, "") if turn.asks_id else ()  # a turn lacks the asker's account and device
         self.changed = self.changed or (asker, turn.others) != (self.asker, self.others)
         self.asker, self.others = asker, turn.others  # others: as at the first owner, see Lease
 

@@ -32,8 +32,8 @@ class BoundedOutput:
         self._tokens, self._filled_at = self._most, now  # lines that may pass now, and when that was computed
         self._newest, self._newest_at, self._repeats = b"", now, 0  # line, without its time, and its repetitions
         self._left_out = 0  # lines that were not written yet, because too many came
-        self._kept: deque[bytes] = deque(maxlen=KEPT)  # the newest of those, which are written after their number
-        self._suppressed_at, self._said_at = float("-inf"), now  # when a line was dropped, and a count written, last
+        self._kept: deque[bytes] = deque(maxlen=KEPT)  # the newest of those: written later, behind a count of the rest
+        self._suppressed_at, self._said_at = float("-inf"), now  # when a line was last not written, and a count was
 
     @property
     def waits(self) -> bool:

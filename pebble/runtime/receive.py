@@ -32,7 +32,7 @@ class Refusals:
         self._log.warning(channel.metric, "refused a message: %s", error)
 
     def reader(self, channel: Channel, deliver: Deliver, remark: codec.Remark | None = None) -> Handler:
-        """Return a handler for subscriptions to ``channel`` that passes valid messages to ``deliver``."""
+        """Return a handler for ``channel`` that passes valid messages to ``deliver``; ``remark``: see codec.Remark."""
         one_shot, is_pattern = channel.one_shot, channel.is_pattern
 
         def receive(message: Message) -> None:

@@ -158,7 +158,7 @@ class Service:
             self._send(channel, topic, raw)
 
     def listen(self, channel: Channel, method: Callable[..., None], *, direct: bool = False) -> Subscription:
-        """Handle ``channel`` until the subscription is closed, as ``@on`` does for the whole run, also ``direct``."""
+        """Handle ``channel`` as ``@on`` does, also with its ``direct``, but only until the subscription is closed."""
 
         def deliver_direct(message: Message, value: Any, names: dict[str, str]) -> None:
             method(value, self.clock() - message.waited_s, **names)
@@ -320,7 +320,7 @@ class Service:
 
         if channel.newest:
             self._inbox.post(handle, newest_of=message.topic)
-        else:  # what ends something gets a name, as named jobs are dropped last; it runs after earlier commands
+        else:  # what ends something is named, so that it is dropped last, and waits behind earlier commands
             self._inbox.post(handle, last_of=message.topic if channel.ends(value) else None)
 
     def _remark(self, channel: Channel, sender: str, text: str) -> None:

@@ -78,7 +78,7 @@ def write(
         except OSError as why:
             if why.errno not in _IN_USE or not file.is_file():
                 raise
-            _write_in_place(file, content, mode)
+            _write_in_place(file, content, mode)  # as for a file mounted into a container
         sync_folder(file.parent)
     except OSError as why:
         raise error(f"{file}: {why.strerror}") from None

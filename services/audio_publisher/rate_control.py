@@ -126,14 +126,17 @@ class LevelControl:
         if now - self._changed_at < _PAUSE_S:
             return False
         if self._slow_since is not None and now - self._slow_since >= _PATIENCE_S and self.level < self._last:
-            # Before the first fall _FIRST_CALM_S was enough; from now on it takes _CALM_S, longer after failed rises.
+            # From the first fall on, calm has to last for _CALM_S at least, and twice as long as before if this fall
+            # comes soon after the last rise: then that rise has failed.
             last_rise_failed = now - self._raised_at < 2 * self._calm_s
             longer_s = 2 * self._calm_s if last_rise_failed else self._calm_s
             self._calm_s = min(max(_CALM_S, longer_s), _CALMEST_S)
             return self._change(1, now)
-        if self.level and self._fast_since is not None and now - max(self._fast_since, self._changed_at) > self._calm_s:
-            self._raised_at = now
-            return self._change(-1, now)
+        if self.level and self._fast_since is not None:
+            calm_since = max(self._fast_since, self._changed_at)  # earlier it was at another step
+            if now - calm_since > self._calm_s:
+                self._raised_at = now
+                return self._change(-1, now)
         return False
 
     def _change(self, by: int, now: float) -> bool:

@@ -97,7 +97,7 @@ class AudioReceiver(Service):
         self._meter.add(self.clock(), len(message.payload))
         if len(self._packets) == _WAITING_PACKETS:  # the oldest goes
             self.counters.add("dropped")
-        self._packets.append((message.payload, time.monotonic()))  # by the clock of the thread that plays
+        self._packets.append((message.payload, time.monotonic()))  # the clock of `_play`
         self._wake.set()
 
     @every(1.0)

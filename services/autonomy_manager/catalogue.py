@@ -169,7 +169,7 @@ class Catalogue:
         version = entry, stamp(entry), stamp(folder / MANIFEST)
         version_before, before, until = self._answers.get(name, (None, _Answer(Description()), 0.0))
         is_current = version_before == version and self._clock() < until
-        if is_current or (version_before is not None and not asks):  # unasked, its old answer counts
+        if is_current or (version_before is not None and not asks):  # not to be asked now: its last answer counts
             return before
         answer = self._describe(folder, entry, section, asks=asks)
         if not answer.asked:  # it is asked later: nothing to keep
@@ -200,10 +200,10 @@ class Catalogue:
         try:
             ours = is_ours(entry)
         except BrokenScriptError as error:
-            if section.python is not None:  # what another Python runs may be written for that
+            if section.python is not None:  # it may be valid for that Python
                 return _Answer(described, problem=problem)
             return _Answer(described, problem=str(error), broken=True)
-        if not ours or not self._asks:  # this catalogue never runs a script
+        if not ours or not self._asks:  # only ours are asked, and only if this catalogue asks
             return _Answer(described, ours, problem)
         if not asks:  # it is ours, and is asked later
             return _Answer(described, ours, problem, asked=False)
@@ -213,7 +213,7 @@ class Catalogue:
             return _Answer(_merged(described, answer), ours, problem, drives=answer.drives)
         except DescribeError as error:
             is_broken = isinstance(error, BrokenScriptError)
-            return _Answer(described, ours, str(error), is_broken)
+            return _Answer(described, ours, problem=str(error), broken=is_broken)
 
     def _command(
         self, folder: Path, entry: Path, section: ScriptSection, described: Description, *, ours: bool

@@ -68,8 +68,9 @@ def _may_run(config: Config, script: Script) -> bool:
     """
     from pebble.services.autonomy_manager.environment import local_login
 
-    program = Path(shutil.which(script.command[0]) or "/")  # a missing one passes: running it tells that
-    if script.environment.keys() - local_login(config) or program.is_relative_to(config.folder):
+    program = Path(shutil.which(script.command[0]) or "/")  # "/": a missing one passes, as running it tells that
+    set_variables = script.environment.keys() - local_login(config)  # without the login, which every script gets
+    if set_variables or program.is_relative_to(config.folder):
         return False
     try:
         return owner_of(program, nameless=False).uid in (0, os.geteuid())

@@ -87,11 +87,11 @@ class MotorOwners:
             boot, count, barred = baseline.setdefault(owner, (state.boot, state.count, 0))
             if state.latched or (state.boot == boot and state.count != count):
                 return _stopped(owner, state)
-            # An owner bars all runs up to a number: that before a run that begins, or the newest as a person drives.
-            # ``barred`` is the number up to which it had barred runs before this one began.
+            # An owner bars all runs up to a number. When a run begins, that becomes the number before it; when a person
+            # drives, it becomes the newest run. ``barred`` is the owner's number from before this run began.
             is_barred = state.last_barred != barred and not newer(run, state.last_barred)
             if signs and is_barred:
-                # A newer run has begun if one is barred, or a command of one was received.
+                # A barred number other than this run's is a newer run, which has begun; or a command of one has come.
                 newer_began = state.last_barred != run or newer(self.newest_run, run)
                 return SUPERSEDED if newer_began else OVERRIDDEN
             if state.boot != boot:

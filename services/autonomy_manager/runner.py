@@ -223,9 +223,10 @@ class Runner:
             self._service.halt_repeatedly(run.number)
             if not run.ending:
                 run.ending = True
-                self.error, self.stopped = f"{part.label} {how}" if code else None, False
+                self.error = f"{part.label} {how}" if code else None
+                self.stopped = False
             self._end_dependencies(run)  # and forgets the run if all have ended
-        else:
+        else:  # a script that the main one needs
             if not run.ending:
                 self.error, self.stopped = f"dependency {part.label} {how}", False
                 self._end()

@@ -25,7 +25,7 @@ from pebble.contract.payloads import (
 )
 from pebble.errors import PebbleError
 from pebble.extensions.scripts.config import AutonomyManager as AutonomyManagerSection
-from pebble.extensions.scripts.runs import LocalScripts, following, next_run
+from pebble.extensions.scripts.runs import LocalScriptsLock, following, next_run
 from pebble.motion.arbiter import HOLD_MS
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.process import view_of
@@ -57,7 +57,7 @@ class AutonomyManager(Service):
         motors = self.config.motor_lines()
         #: With the names of topics that are configured for the serial line of the motors.
         self.addresses = Addresses(view_of(self.config, next(iter(motors), "")))
-        self._local = LocalScripts(self.config)
+        self._local = LocalScriptsLock(self.config)
         self._owners = MotorOwners(self.config.motor_owners)
         processes = Processes(self.config.run_dir() / "scripts.lock")
         self.on_stop(processes.close)
@@ -95,6 +95,7 @@ class AutonomyManager(Service):
 
     @on(AUTONOMY_COMMAND)
     def command(self, command: AutonomyCommand) -> None:
+        """Start a script, or stop the one that runs; ``enabled`` decides only where ``action`` is no known word."""
         word = (command.action or "").strip().lower()
         is_known = word in (*_START, *STOP_WORDS)
         begin = word in _START if is_known else command.enabled
@@ -237,7 +238,7 @@ class AutonomyManager(Service):
             self._local.release()
             raise
         self._signs, self._unsigned_moves = plan.main.script.ours, False
-        for number in self._owners.steps_to(run):  # zeros of numbers in between: else an owner may think it older
+        for number in self._owners.steps_to(run):  # a zero of each: else an owner may take ``run`` for older
             self.halt(number)
         return run, self._owners.baseline()
 
@@ -272,6 +273,7 @@ class AutonomyManager(Service):
             self.publish(AUTONOMY_STATUS, replace(status, timestamp=time.time()))
 
     def _present_status(self) -> AutonomyStatus:
+        """Return the status. The fields that ``replace`` sets are left out of the message where they do not apply."""
         run = self._runner.run
         main = None if run is None else run.running
         parts = [] if run is None else run.dependencies

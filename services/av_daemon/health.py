@@ -39,15 +39,15 @@ class RateCheck:
         """Make a measurement. ``asked_hz``: the rate that was asked for; 0: any."""
         self.wrong_hz: float | None = None  # the measured rate, if another was asked for
         self._asked_hz = asked_hz
-        self._window: float | None = None  # when the measurement of the rate began, or begins
-        self._count = 0  # contents in the measurement; -1: it has not begun
+        self._window: float | None = None  # when the measurement of the rate began, or, while it settles, will begin
+        self._count = 0  # frames in the measurement; -1: it has not begun
 
     def clear(self) -> None:
         """Forget the source's history, because it was opened again."""
         self.wrong_hz = self._window = None
 
     def count(self, times: int, now: float) -> None:
-        """Count contents. ``times``: how many have come since the last call."""
+        """Count frames. ``times``: how many have come since the last call, also those that were skipped."""
         if self._window is None:
             self._window, self._count = now + _SETTLE_S, -1  # the source settles first
         if now < self._window:

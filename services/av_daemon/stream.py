@@ -19,7 +19,10 @@ _HUNG_LIMIT = 3  # threads whose device never answers, before no more are starte
 
 
 class Stream:
-    """The stream. All methods are for the service's thread. Call ``poll`` now and then."""
+    """The stream. All methods are for the service's thread. Call ``poll`` now and then.
+
+    ``first_delay_s``, ``asked``: see :class:`Health`; ``rest_s``: without a reader, until the device is closed.
+    """
 
     def __init__(
         self,
@@ -33,9 +36,9 @@ class Stream:
     ) -> None:
         self.name, self._writer, self._open_source, self._rest_s = name, writer, open_source, rest_s
         self._health = Health(first_delay_s, asked)
-        self._told: frozenset[str] = frozenset()  # kinds of problems
+        self._told: frozenset[str] = frozenset()  # kinds of problems that were logged, and last
         self._capturer = self._start(0.0)
-        self._hung: list[Capturer] = []
+        self._hung: list[Capturer] = []  # abandoned threads that have not ended, as their device does not answer
 
     def poll(self, now: float) -> None:
         """Abandon a device that is overdue, and open it again in another thread; log problems of its frames."""

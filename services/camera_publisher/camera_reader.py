@@ -95,9 +95,8 @@ class CameraReader:
             frame = reader.read(_POLL_S)
             if self._enabled.is_set():
                 enabled_at = time.monotonic()
+                if frame is not None:
+                    self._put(frame)
+                    self._on_frame()
             elif frame is not None:
                 frame.release()
-                frame = None
-            if frame is not None:
-                self._put(frame)
-                self._on_frame()

@@ -180,16 +180,16 @@ class LevelControl:
         for memory in (self._seen, self._lost):
             while memory and now - memory[0][0] > _WINDOW_S:
                 memory.popleft()
-        stuck_s = age_s if age_s <= now - self._changed_at else 0.0  # only if sent since the last change
-        if stuck_s > _STUCK_S:
-            return self._go_down(max(stuck_s / self._frame_s, self._load), now)  # the load is at least this frame's
+        is_of_this_step = age_s <= now - self._changed_at  # it was sent since the last change
+        if is_of_this_step and age_s > _STUCK_S:
+            return self._go_down(max(age_s / self._frame_s, self._load), now)  # the load is at least that of this frame
         if now - self._changed_at < _MEASURE_S or not self._seen:
             self._good_since = now
             return False
         load = self._load
         if load > _FULL:
             return self._go_down(load, now)
-        # Good times begin anew while there is no step up, or one that would raise the load above _AIM.
+        # Time counts as good only while there is a step up that would keep the load at _AIM or below.
         if self.level == 0 or load * STEPS[self.level - 1].cost / self.step.cost > _AIM:
             self._good_since = now
         elif now - self._good_since >= self._patience:
@@ -219,11 +219,11 @@ class LevelControl:
         A step up that was just tried is undone; the next one has to wait longer.
         """
         lower = range(self.level + 1, len(STEPS))
-        affordable = self.step.cost * _AIM / load
+        affordable = self.step.cost * _AIM / load  # the cost at which the load would be _AIM
         if self._rose_at is not None and now - self._rose_at < _PROBATION_S:
             self._patience = min(_LONGEST_PATIENCE_S, max(_PATIENCE_S, 2 * self._patience))
             if load <= 2 * _FULL:
-                affordable = self.step.cost  # one step down, to where it came from; at a higher load further
+                affordable = self.step.cost  # the next step costs less: one step down, to where it came from
         self._rose_at = None
         level = next((level for level in lower if STEPS[level].cost <= affordable), len(STEPS) - 1)
         return self._change(level, now)

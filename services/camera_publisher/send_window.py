@@ -67,8 +67,8 @@ class SendWindow:
         frames, slack_s = self._frames.acknowledge(waiting), self._slack_s(now)
         acknowledged = []
         for frame in frames:
-            began = max(frame.at + round_trip_s, self._free_at)  # before, it was on its way or behind another frame
-            self._free_at = now  # so of frames that are acknowledged together only the first took time
+            began = max(frame.at + round_trip_s, self._free_at)  # until then it travelled, or waited behind another
+            self._free_at = now  # so the others that are acknowledged with it took no time
             is_prompt = now - frame.at - round_trip_s <= _PROMPT_S
             self._limit = max(1, min(_MOST, self._limit + (1 if is_prompt else -1)))
             took_s = max(0.0, now - began)

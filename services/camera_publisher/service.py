@@ -153,7 +153,7 @@ class CameraPublisher(Service):
         picture = self._shape.picture(frame, self._rate.step.size)
         payload = self._encode(picture, frame.info.captured_ms)
         now = self.clock()
-        # It measures how long a value stays the same: black pictures have one, any other the time, which never repeats.
+        # SourceCheck measures how long a value stays the same. Black pictures have one; others the time, always new.
         self._blackness.take(_BLACK if is_black(picture) else now, now)
         if not frame.valid():
             self._throw_away("overwritten")  # by the next frame, while it was encoded

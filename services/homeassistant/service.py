@@ -81,7 +81,8 @@ class HomeAssistantService(Service):
                 self._sent, self._sent_at, self._due = self._wanted, now, False
         in_use = {self._discovery_topic} if self._section.enabled else set()
         old = self._retained - in_use
-        if old and old <= self._emptied and not self._remote.outgoing.waiting:  # the broker has confirmed all
+        all_are_emptied = old <= self._emptied and not self._remote.outgoing.waiting  # and the broker has confirmed it
+        if old and all_are_emptied:
             self._save(self._retained - old)
         for topic in old - self._emptied:
             if self._publish(topic, b""):

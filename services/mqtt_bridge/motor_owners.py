@@ -37,10 +37,10 @@ class MotorOwners:
             count, count_before = self._messages[topic], self._checked[topic]
             self._checked[topic] = count
             waits_since, is_live = self._waits_since[topic], count > 1  # the first may be a retained one
-            if waits_since is None or (is_live and count != count_before):  # it waits for the next one from now on
+            if waits_since is None or (is_live and count != count_before):  # wait for the next from now on
                 waits_since = self._waits_since[topic] = now
             reached = now - waits_since < _MISSED_S
             if reached and not is_live:
-                continue  # a live message may still come in time
+                continue  # no live message yet, but one may still come in time: nothing to report
             if reached != self._reported[topic] and self._notifier.reaches(owner, reached):
                 self._reported[topic] = reached

@@ -146,7 +146,7 @@ class MqttBridge(ForwardingService):
         if self.config.security.named:
             filters.append(with_name(self._stop_topic, "+"))
         make = partial(StopConnection, transport, filters, self._pass_stop, self._forwards, self.clock)
-        if not self._is_thin:  # over a thin link this connection is worth its cost only while a client floods it
+        if not self._is_thin:  # a thin link carries this connection only while a client floods it, see ``wanted``
             return make(notices_s=self._silence_s + _NOTICED_S)
         transport.suit_link(thin=True)
         notices_s = max(self._silence_s, LEVELS["thin"].silent_s) + _NOTICED_S
@@ -219,7 +219,7 @@ class MqttBridge(ForwardingService):
 
     def connected(self, side: Side, epoch: int) -> None:  # see ForwardingService
         if side is Side.REMOTE:
-            if self.forwarder.gate is Gate.SHUT:  # else subscribe_remote() does that, which follows the check
+            if self.forwarder.gate is Gate.SHUT:  # else subscribe_remote() does that, below or after the check
                 self._publish_heartbeat(at_once=True)
         else:
             barrier(self.transport, self._same_broker.topic)  # until the robot's retained messages have arrived
@@ -269,14 +269,14 @@ class MqttBridge(ForwardingService):
         if self._same_broker.proves_two_brokers(round_):
             self._begin_forwarding()
 
-    def _begin_forwarding(self) -> None:
+    def _begin_forwarding(self) -> None:  # does nothing if it forwards already
         if self.remote.state is not State.CONNECTED or self.forwarder.gate is Gate.OPEN:
             return
         was_shut = self.forwarder.gate is Gate.SHUT
         self.forwarder.open()
         if was_shut:  # what was received meanwhile was dropped: a new subscription brings the retained messages again
             self.unsubscribe(Side.LOCAL)
-            self.forwarder.sides[Side.LOCAL].subscribing()
+            self.forwarder.sides[Side.LOCAL].subscribing()  # as at a new connection
             self.subscribe_local()
             self.forwarder.subscribed(Side.LOCAL)
         self.subscribe_remote()  # only now; the local side was subscribed to while the gate was WAITING
@@ -310,7 +310,7 @@ class MqttBridge(ForwardingService):
         forwards = gate is Gate.OPEN and bool(self.subscriptions[Side.REMOTE])
         passes = self._same_broker.both_connected and (needs_no_bridge or forwards)
         late, refused = counters[f"{Side.REMOTE.value}: {Drop.LATE.value}"], counters[f"{Side.LOCAL.value}: refused"]
-        # Any change of these may mean that a message was lost.
+        # Any change of these may mean a loss on the way in: late from the remote side, or refused by the local one.
         losses = gate, self.epoch, self._local_changes, refused, late, self.transport.counters["dropped"]
         self.publish(c.CONTROL_VOUCHED, self._vouching.check(passes, losses, self.clock()))
 
@@ -340,7 +340,7 @@ class MqttBridge(ForwardingService):
             return
         if self._heartbeat is not None and message.topic == self._heartbeat.topic:
             if self._heartbeat.is_ours(message) and self.forwarder.gate is Gate.OPEN:
-                # one broker after all, or another program's heartbeat of the same millisecond
+                # it was sent to the other side: one broker after all, or another program's of the same millisecond
                 self.post_message(c.BRIDGE_PROBE, self._same_broker.send_again, newest_of="suspect")
             return
         if message.topic in self._owners.topics:
@@ -348,8 +348,8 @@ class MqttBridge(ForwardingService):
             self._follow_owner(self._owners.topics[message.topic], message.payload)
         if message.topic == self._control_topic:
             self._follow_control(message.payload)
-        if message.topic == self._stop_topic and not message.retain:  # the owners have it unless one restarts now
-            self._passed_stops.accept(named(message.payload), nameless=not is_named(message.payload))  # it gets a name
+        if message.topic == self._stop_topic and not message.retain:  # the owners have it, except one that restarts now
+            self._passed_stops.accept(named(message.payload), nameless=not is_named(message.payload))  # `named` adds it
         self._leftovers.note_local(message)
         for admitted in self._private.admit(message):
             self._react(Side.LOCAL, admitted, self.forwarder.receive(Side.LOCAL, admitted))
@@ -359,7 +359,7 @@ class MqttBridge(ForwardingService):
         keys = None  # without a valid state: the stamp of every command is judged
         with suppress(PayloadError):
             state: ControlState = codec.decode(c.CONTROL_STATE, payload)
-            keys = frozenset([state.key.encode()]) - {b""}  # none if no client has control: no stamp is judged
+            keys = frozenset([state.key.encode()]) - {b""}  # key "": no client has control, so no stamp is judged
             self._observers.tell(Observer.control, state)
         self.forwarder.ages.keys = keys
 
@@ -421,7 +421,7 @@ class MqttBridge(ForwardingService):
             self.refusals.stale("a command" if channel is None else channel.metric)
             return
         if isinstance(routed.outcome, Drop) and (routed.outcome in _IGNORED or not is_local):
-            return  # of dropped messages only the robot's own may be requests, unless dropped for these reasons
+            return  # a dropped message is a request only if it is the robot's own, and not dropped for one of _IGNORED
         if channel is None or codec.is_blank(message.payload):
             return
         if not message.retain and routed.outcome is not Drop.KNOWN:  # KNOWN: nothing new for observers

@@ -69,7 +69,7 @@ class Copies:
             if copy is not None:
                 expected.remove(copy)
                 if way is Way.MAIN:
-                    short = message.payload[:MAX_COMMAND_BYTES]  # if it is cut off it is still a stop, without a name
+                    short = message.payload[:MAX_COMMAND_BYTES]  # cut off it is a stop still, but has no name
                     self._dropped.append((now, Message(message.topic, short, message.qos)))
                 return True
             if comes_both_ways and not message.retain:  # with the flag it may be an old one, of which there is no copy
@@ -158,7 +158,7 @@ class StopConnection:
     def main_lost(self, *, ended: bool) -> None:
         """Note that the main connection is lost; ``ended``: the broker has closed it."""
         self._copies.forget()
-        if self._clock() - self._connected_at >= _KICKED_S:  # it was not lost because of this one
+        if self._clock() - self._connected_at >= _KICKED_S:  # not because of this one; never true before it was made
             self._kicks = 0
         elif ended and self.listens:
             self._kicks += 1
@@ -194,7 +194,7 @@ class StopConnection:
         if state is State.CONNECTED:
             self._connected_at = self._clock()
             return
-        doubtful = self._copies.lost()  # dropped as copies, though perhaps only the main connection had them
+        doubtful = self._copies.lost()  # came over the main connection, dropped as copies, perhaps wrongly
         if state is State.CONNECTING:  # it was lost; if it is CLOSED, we have ended it
             for message in doubtful:
                 self._pass_on(message)

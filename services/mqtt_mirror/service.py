@@ -79,9 +79,9 @@ class MqttMirror(ForwardingService):
             return
         if epoch != self.epoch:  # that connection is lost already
             return
-        if not self.remote.exact_echo:  # then echo=False is not kept to
+        if not self.remote.exact_echo:  # its own messages come back in spite of echo=False
             self._refuse('sends our own messages back; use one with bridge mode (mosquitto), or protocol "5"')
-        elif self.forwarder.gate is Gate.OPEN:  # the broker was checked; a probe shows if it is another now
+        elif self.forwarder.gate is Gate.OPEN:  # its broker was checked before; a probe shows if it is another now
             self.subscribe_remote()
             self._request_probe()
         else:
@@ -110,7 +110,7 @@ class MqttMirror(ForwardingService):
         barrier(self.remote, self._probe_topic)  # receives what the broker has sent by now; a probe shuts the gate
         if epoch != self.epoch or self.forwarder.gate is not Gate.WAITING:
             return
-        if self._is_operators and not self._announced:  # without a new probe the earlier verdict stands
+        if self._is_operators and not self._announced:  # without a probe nothing shows another broker
             self._refuse(self._refused)
             return
         self._is_operators, self._refused = False, ""

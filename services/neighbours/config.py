@@ -67,13 +67,16 @@ def _check(reader: Reader, section: Neighbours, path: Path) -> Neighbours:
     for name, granted in section.commanded.items():
         if any(metric != DRIVE.metric for metric in granted):
             problem((*path, "commanded", name), f'must be ["{DRIVE.metric}"]: nothing else can be granted')
-    metrics_at = {("shares",): section.shares} | {("listens", name): heard for name, heard in section.listens.items()}
+    metrics_at: dict[Path, tuple[str, ...]] = {("shares",): section.shares}  # by the path of their key
+    for name, heard in section.listens.items():
+        metrics_at["listens", name] = heard
     for place, metrics in metrics_at.items():
         if len(metrics) > MOST_METRICS:
             problem((*path, *place), f"has {len(metrics)} metrics: {MOST_METRICS} are the most")
         for metric in metrics:
             channel = channel_of(f"{OUTGOING}/{metric}")
-            if is_reserved(metric) or (channel is not None and not (channel.remote and channel.bridged)):
+            is_forwarded = channel is None or (channel.remote and channel.bridged)  # by bridges, to operators
+            if is_reserved(metric) or not is_forwarded:
                 problem((*path, *place), f"{metric} cannot be shared: no pictures or sound, nor who stops and drives")
     return section
 

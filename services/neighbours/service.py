@@ -22,7 +22,7 @@ from pebble.contract.identity import Identity
 from pebble.contract.payloads import Drive, Neighbours
 from pebble.errors import PebbleError
 from pebble.extensions.operator.client.robot_estop import RobotEstop
-from pebble.extensions.scripts.runs import LocalScripts, next_run
+from pebble.extensions.scripts.runs import LocalScriptsLock, next_run
 from pebble.extensions.scripts.script.neighbour import PRESENT_S
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.connections import client_of_hub
@@ -50,8 +50,9 @@ class NeighboursService(Service):
         self.addresses = Addresses(view_of(self.config, next(iter(self.config.motor_lines()), "")))
         self._lan = lan or _lan_transport(self.config)
         self._others = {name: Identity(me.system, me.type, name) for name in self._section.listens}
-        self._local = LocalScripts(self.config)
+        self._local = LocalScriptsLock(self.config)
         self._estop = RobotEstop(self.config.base)
+        # `begin` without its last two arguments, another robot and its run.
         begins = partial(begin, self.config.state_file("neighbour-runs"), self._section.commanded)
         self._visit = Visit(begins, self._number, partial(self.publish, DRIVE), self._local_runs)
         self._received_at: dict[str, float] = {}  # by robot: when its state came last, which shows its presence
@@ -161,7 +162,10 @@ class NeighboursService(Service):
     # -- what a visit needs
 
     def _number(self, barred: int, received: int) -> int | None:
-        """Return a number here for another robot's run; None if this robot's script runs, or no number can be made."""
+        """Return a number here for another robot's run; None if this robot's script runs, or no number can be made.
+
+        ``barred`` and ``received``: runs, of which it must be newer; see `next_run`.
+        """
         with self._local.none_runs() as free:
             try:
                 return next_run(self.config, barred, received) if free else None

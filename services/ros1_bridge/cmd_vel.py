@@ -128,7 +128,7 @@ class CmdVel:
             self._body, self._until, self._zeros = ZERO, 0.0, ZEROS
             if not self._ends:
                 self._out.send(ZERO)
-            if not self._latched:  # else each call would put off the lock, which the thread repeats
+            if not self._latched:  # else each call would put off the next repetition of the lock
                 self._plan(time.monotonic())
 
     def latch(self, latched: bool) -> None:
@@ -208,6 +208,7 @@ class CmdVel:
         self._due = due
 
     def _run(self) -> None:
+        """Send what is due: the newest command while it is valid, then zeros; while stopped, zeros with the lock."""
         with self._changed:
             while not self._ends:
                 now = time.monotonic()

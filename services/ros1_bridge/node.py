@@ -76,7 +76,7 @@ class Node:
         self._threads: list[threading.Thread] = []
         self._calls: queue.Queue[Callable[[], None]] = queue.Queue(_MOST_CALLS_WAITING)
         self._jobs: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # of the thread of sockets
-        self._greetings: dict[Subscriber, float] = {}  # and when they began
+        self._greetings: dict[Subscriber, float] = {}  # connections without a request yet, and when they were made
         self._select = selectors.DefaultSelector()
         self._waker, self._wakes = socket.socketpair()  # a byte into the first ends the wait for the second, in _select
         self._waker.setblocking(False)
@@ -319,6 +319,7 @@ class Node:
         self._in_sockets(close)
 
     def _run_sockets(self) -> None:
+        """Serve the sockets until the node ends; close connections that have said nothing for GREETING_S."""
         while not self._ends.is_set():
             for key, _ in self._select.select(0.25 if self._greetings else 1.0):
                 self._attempt(key.data)

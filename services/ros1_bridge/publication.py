@@ -108,12 +108,14 @@ class Publication:
                     log.debug("%s: %s is gone already", self.topic, subscriber.name)
 
     def _send(self, subscriber: Subscriber, data: bytes) -> bool:
+        """Send to one subscriber; False if it cannot take the message now, which is then dropped, or is gone."""
         try:
             was_sent = subscriber.send(data)
         except OSError as error:
             self._remove(subscriber, str(error))
             return False
-        self.dropped += not was_sent
+        if not was_sent:
+            self.dropped += 1
         return was_sent
 
     def _remove(self, subscriber: Subscriber, why: str) -> None:

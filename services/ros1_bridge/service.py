@@ -140,7 +140,10 @@ class Ros1Bridge(Ros1Reader, MotorOwner):
             self.log.info("the base: %s", f"{verdict}, {why}" if why else verdict)
 
     def assess(self) -> tuple[str, int | None, str]:
-        """Return the fields of :class:`notes.Mcu`: state, age of the last report (None: unknown), and reason."""
+        """Return the fields of :class:`notes.Mcu`: state, age of the last report (None: there was none), and reason.
+
+        The age is not measured: 0 stands for a base that sends odometry and does not hang.
+        """
         node, topic = self.node, self.section.ros.cmd_vel_topic
         if not self.cmd_vel.bases:
             return "absent", None, node.problem or f"nobody subscribes to {topic}"

@@ -49,7 +49,7 @@ class SerialService(Service, ABC):
         self._holders: list[str] = []  # other programs at the device
         self._misread = False  # at the last check bytes had come, and no report was understood
         self._heard = self._heard_opened = 0  # how many reports were understood, and in which opening of the line
-        self._reported = Reported(Notifier().mcu)
+        self._reported = Reported(Notifier().mcu)  # what report_mcu finds
         self.line = SerialLine(
             section.serial.port,
             section.serial.baud,

@@ -85,7 +85,7 @@ class Clips:
         except OSError:  # too long
             return None
         inside = path.relative_to(root).as_posix()
-        return Clip(inside if is_text(inside) else name, path)  # not UTF-8: the command named a link to it
+        return Clip(inside if is_text(inside) else name, path)  # ``name`` is that of a link to it
 
     def _paths(self) -> Iterator[str]:
         """Yield the paths of the clips among the first _MOST files, in the folder's order and spelling."""

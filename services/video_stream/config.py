@@ -43,7 +43,8 @@ def _without_login(url: str) -> str:
     authority = re.split(r"[/?#\s]", after, maxsplit=1)[0]
     if "@" in authority:
         return f"{before}{slashes}{authority.rpartition('@')[2]}{after[len(authority) :]}"
-    # An @ behind the authority is part of a path. But if no port follows its colon, that is a password with a slash.
+    # An @ behind the authority is part of a path. But if the authority has a colon without a port behind it, a password
+    # begins there that has a slash in it, and the @ is the end of the login.
     has_password = re.search(r":(?!\d*$)", authority)
     if "@" in after and has_password:
         return f"{before}{slashes}{after.rpartition('@')[2]}"

@@ -169,7 +169,7 @@ class MemoryTransport(Transport):
     def _run(self) -> None:
         while True:
             with self._hub.lock:
-                while not (self._stopping or self._inbox or self._attached != self._hub.era):  # the last: see _work
+                while not (self._stopping or self._inbox or self._attached != self._hub.era):  # era: hub changed
                     self._changed.wait()
                 if self._stopping:
                     return

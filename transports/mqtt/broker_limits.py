@@ -97,7 +97,7 @@ class BrokerLimits:
         """Note how a CONNECT has ended whose will was fitted to `limits`. The first line that fits counts.
 
         *Again*: it was sent at once, after an accepted probe or with less than the one before (`Asking.AGAIN`).
-        *First*: any other. After "at once" the result of the next CONNECT is noted here, too.
+        *First*: any other. The result of a probe is for `note_probe`; after it the next CONNECT is noted here again.
 
         | result                             | tried | the next CONNECT is                                |
         |------------------------------------|-------|----------------------------------------------------|
@@ -115,7 +115,7 @@ class BrokerLimits:
             self._reduce(replace(self.limits, qos=0), now)
         elif result is Result.HUNG_UP and not again:
             self._asking = Asking.WITHOUT_WILL
-        elif result is Result.HUNG_UP and self.limits in _STEPS[:-1]:
+        elif result is Result.HUNG_UP and self.limits in _STEPS[:-1]:  # not the last: there is less
             self._reduce(_STEPS[_STEPS.index(self.limits) + 1], now)
         elif again and result is not Result.ACCEPTED:
             self.limits = EVERYTHING

@@ -47,7 +47,7 @@ class TlsLateError(TimeoutError):
 
 
 def begin_tls(plain: socket.socket, opening: Opening) -> ssl.SSLSocket:
-    """Return a non-blocking socket with TLS, which closes ``plain``; so does a failed handshake. Raises OSError."""
+    """Return a non-blocking socket with TLS that takes over ``plain``. Raises OSError; a failed handshake closes it."""
     assert opening.context is not None  # noqa: S101 - else there is no TLS
     name = opening.settings.host.partition("%")[0]  # without the network card of an address: fe80::1%eth0
     sock = opening.context.wrap_socket(plain, server_hostname=name, do_handshake_on_connect=False)
@@ -145,11 +145,11 @@ class Client:
     # -- reading
 
     def receive(self) -> int:
-        """Take bytes out of the socket; return their number. Call this when `read` has left none.
+        """Take bytes out of the socket; return their number. Call this when `read` has left no bytes unread.
 
         If the other side has closed the connection, `socket` is None afterwards.
         """
-        sock, self.drained = self.socket, True
+        sock, self.drained = self.socket, True  # unless bytes come
         if sock is None:
             return 0
         try:
@@ -161,7 +161,7 @@ class Client:
         if not data:
             self.hung_up = is_hang_up(error)
             self.close()
-        # With TLS the number of unpacked bytes does not tell whether the socket has more.
+        # Fewer bytes than asked for: the socket has no more. With TLS their number does not tell that.
         self.drained = not data or (len(data) < _PIECE and self._opening.context is None)
         self._reader.feed(data)
         return len(data)
@@ -225,7 +225,7 @@ class Client:
         if self.waiting:  # the socket accepts no more: the connection is discarded without DISCONNECT
             return
         if self.socket is not None:
-            with suppress(OSError, ValueError):  # it sends nothing more; it has ended
+            with suppress(OSError, ValueError):  # the broker's side sends nothing more, or has ended the connection
                 self.socket.shutdown(socket.SHUT_WR)
                 self.socket.settimeout(_ENDING_S)
                 end = time.monotonic() + _ENDING_S  # also for a broker that goes on sending

@@ -95,7 +95,7 @@ class Connection:
         try:
             self.client.open()
         except (OSError, ValueError) as error:
-            # Absent if nothing listens there, TlsLate if TLS takes too long, else Lost.
+            # By the kind of the error: Absent if nothing listens there, TlsLate if TLS takes too long, else Lost.
             ending = next((ending for kind, ending in _UNREACHED.items() if isinstance(error, kind)), Lost)
             why = unreached(error, tls=self._settings.tls is not None)
             raise ending(f"{self.where} cannot be reached: {why}") from None
@@ -205,7 +205,7 @@ class Connection:
                     self._poll.register(self.client.socket)
         if self.client.socket is None:
             raise self.incoming.lost
-        blocked, waiting = bool(self.client.waiting), self.incoming.age.waiting
+        blocked, waiting = bool(self.client.waiting), self.incoming.age.waiting  # client.waiting: to be written
         began = now = clock.since_boot()
         wait_s = min(timeout, self.pings.due_at - began)
         ready = NOTHING
@@ -347,8 +347,8 @@ class Connection:
                 return Outgoing()
             waiting = self._backlog.size + self.client.unwritten + unconfirmed_bytes(sock)
             round_trip_s, since = shortest_round_trip_s(sock), self.in_flight.waiting_since
-            # The longer round trip, as TCP's may end at a proxy; and twice that, as a broker without TCP_NODELAY holds
-            # an answer back until the one before it is acknowledged.
+            # The longer of two round trips, as TCP's may end at a proxy. It counts twice, as a broker without
+            # TCP_NODELAY holds an answer back until the one before it is acknowledged.
             usual_s = 2 * max(round_trip_s, self.in_flight.round_trip_s)
             stalled_s = 0.0 if since is None else max(0.0, clock.since_boot() - since - usual_s)
             return Outgoing(waiting, round_trip_s, stalled_s)

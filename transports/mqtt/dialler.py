@@ -162,16 +162,16 @@ class Dialler:
         if late:
             self.addresses.was_slow()
         if self.loses_large or not (silent or late):
-            return False  # they are small already, or it tells nothing of large ones: no silence, no late TLS
+            return False  # segments are small already, or this end tells nothing of large packets
         self._large_lost = self._large_lost + 1 if self._may_have_lost_large(lost) else 0
         return self.loses_large
 
     def is_gone(self, lost: Lost, *, connected: bool, was_ended: bool) -> bool:
-        """True if the broker's process seems to have ended. ``was_ended``: the result of the last call.
+        """True if the broker's process seems to have ended. ``was_ended``: the result of the call before this.
 
-        1. A connection was lost (``connected``): True, unless the broker was only silent. It may be we who stood still.
-        2. Nothing listens there: the last result.
-        3. An attempt failed otherwise: the last result; False after silence, or if 1 or 2 is more than `_ENDING_S` ago.
+        1. A connection was lost (``connected``): True, unless the broker was silent. Then we may have stood still.
+        2. Nothing listens there: this decides nothing, so ``was_ended``.
+        3. An attempt failed otherwise: False after silence, or if 1 and 2 are `_ENDING_S` ago; else ``was_ended``.
         """
         now, was_silent = time.monotonic(), isinstance(lost, Silent)
         if connected:
@@ -188,12 +188,12 @@ class Dialler:
         ``held_s``: how long a connection lasted, or 0. Return the problem in words ("": none yet), and True to log it.
         """
         addresses, asks_again = self.addresses, self.limits.asks_again
-        if self._is_last_attempt and not asks_again:  # it was asked in every way, so this address has failed
+        if self._is_last_attempt and not asks_again:  # no other way to ask it is left: this address has failed
             why = problem.removeprefix(f"{addresses.where} ")  # the list of failures names the addresses
             failures = addresses.failed(why, held_s)
             if addresses.several:
                 problem = f"broker {addresses.host_port}: {failures}"
-        if asks_again and held_s <= 0:  # only an attempt has failed: the next one shows what the problem is
+        if asks_again and held_s <= 0:  # not logged: it is asked once more, and that shows the problem
             return "", False
         # Of a round through several addresses, only the end is worth a line.
         return problem, held_s > 0 or addresses.is_over or not addresses.several

@@ -32,8 +32,8 @@ def overlap(first: str, second: str) -> bool:
             return False
     if len(first_levels) == len(second_levels):
         return True
-    compared = min(len(first_levels), len(second_levels))
-    return max(first_levels, second_levels, key=len)[compared] == "#"  # it matches its parent as well
+    longer, compared = max(first_levels, second_levels, key=len), min(len(first_levels), len(second_levels))
+    return longer[compared] == "#"  # a/# matches a as well
 
 
 def cover(first: str, second: str) -> str:

@@ -74,11 +74,11 @@ class Incoming:
     # -- called by the connection
 
     def check_silence(self, now: float) -> None:
-        """Raise Silent if the broker has not answered for too long."""
+        """Raise Silent if the broker has not answered for `pings.silence_limit_s`, which is never below `silence_s`."""
         if self.accepted is None:
             return  # `connect` has its own deadline, and gives the first round trip
         silent_s = now - max(self.answered_at, self.age.arriving_at)
-        if silent_s > self.silence_s and silent_s > (limit := self.pings.silence_limit_s):  # the quick limit first
+        if silent_s > self.silence_s and silent_s > (limit := self.pings.silence_limit_s):
             self._counters.add("silences")
             raise Silent(f"{self.where} has not answered for {limit:.1f} s")
 
@@ -91,7 +91,7 @@ class Incoming:
         while (packets_left := began_with + _BATCH - self._packets) > 0:
             packets_before = self._packets
             size += self._read_piece(client, now, packets_left)
-            if not self.more or self._packets == packets_before:
+            if not self.more or self._packets == packets_before:  # no packet has ended: the next call goes on
                 break
             now = clock.since_boot()
         if size and self.pings.is_thin:  # any sign of life counts: answers wait behind messages of others
@@ -131,7 +131,7 @@ class Incoming:
         if now - waiting.checked_at > OVERSLEPT_S and self.accepted is not None:  # no pings before the CONNACK
             self.pings.send_after_stall(client, now)
         size = client.receive()
-        waiting.found(size if client.drained else size + readable_bytes(client.socket), now)  # with bytes not read yet
+        waiting.found(size if client.drained else size + readable_bytes(client.socket), now)  # and what is left there
         return size
 
     @property
@@ -186,7 +186,7 @@ class Incoming:
         self._in_flight.pong(self.answered_at)
         self.age.delay.answered(self.answered_at)
 
-    def on_answer(self, mid: int, codes: bytes) -> None:
+    def on_answer(self, mid: int, codes: bytes) -> None:  # a SUBACK or UNSUBACK, see packets.Listener
         self._note_answer()
         answers = list(zip(self._in_flight.answer(mid), codes, strict=False))
         self.answers.update((filter_, code >= reasons.FAILURE) for filter_, code in answers)

@@ -300,7 +300,7 @@ class Reader:
         if not (first & RETAIN and payload_at < stop and self._listener.skips(topic)):  # an empty one is a removal
             self._listener.on_publication(topic, data[payload_at:stop], first)
 
-    def _other(self, first: int, body: bytes) -> None:
+    def _other(self, first: int, body: bytes) -> None:  # a packet that is neither a PUBLISH nor a whole PUBACK
         if first not in _SHORTEST or len(body) < _SHORTEST[first]:
             raise MalformedError(f"a packet that begins with {first:02x} and has {len(body)} bytes")
         if first in (_SUBACK, _UNSUBACK):
@@ -326,7 +326,7 @@ class Reader:
         if body[1]:
             self._listener.on_refused(body[1])
             return
-        values = properties(body[2 : 2 + self._properties_size(body)])  # by number; next in the order of Accepted
+        values = properties(body[2 : 2 + self._properties_size(body)])  # by identifier; below as Accepted orders them
         accepted = Accepted(*map(values.get, (_MAXIMUM_PACKET, _RECEIVE_MAXIMUM, _MAXIMUM_QOS, _RETAIN_AVAILABLE)))
         if accepted.receive_maximum is not None:
             self._quota.begin(accepted.receive_maximum)
@@ -390,7 +390,7 @@ def properties(data: bytes) -> dict[int, int]:
             values[number] = int.from_bytes(data[at : at + size], "big")
             at += size
         elif number in _TEXTS:
-            for _ in range(_TEXTS[number]):
+            for _ in range(_TEXTS[number]):  # skips as many texts, each of which begins with its length
                 at += 2 + int.from_bytes(data[at : at + 2], "big")
         else:
             _, at = _read_variable(data, at)  # a subscription identifier, or one that no version has yet

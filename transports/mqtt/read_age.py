@@ -95,7 +95,7 @@ class BrokerDelay:
             self._read_answer = ping.sent_at, took_s
             self._newest = took_s if ping.clear else 0.0  # else our own data held up the ping
             self.usual(took_s)  # if it is the shortest
-        is_near = self._shortest <= _NEAR_S  # else an older ping's answer may well come soon after the newest ping
+        is_near = self._shortest <= _NEAR_S  # far away, an answer soon after the newest ping may be an older ping's
         if is_near and self._pings and now - self._pings[-1].sent_at <= self._shortest + _NEAR_S:
             self._prompt += 1
         else:

@@ -51,7 +51,7 @@ class RefusedTopics:
         self._trial: Trial | None = None
         self._quiet_at = -inf  # a trial begins after this time, which is QUIET_S after the newest loss
         #: Topics that were logged as refused, withheld or not: why, and when that was last in the log.
-        self.not_taken = BoundedTable[tuple[str, float]](TOPICS, TOPICS * MAX_BYTES, lambda _: 0)  # 0: topics count
+        self.not_taken = BoundedTable[tuple[str, float]](TOPICS, TOPICS * MAX_BYTES, lambda _: 0)  # only topics count
 
     def accepts(self, message: Message) -> bool:
         """True if ``message`` may be sent: its topic is not withheld, or is on trial."""
@@ -99,7 +99,7 @@ class RefusedTopics:
             suspects = {topic: size for topic, size in often.items() if not self._is_vital(topic)}
         if len(suspects) == 1:
             self._blame(where, *suspects.popitem(), now)
-        elif suspects:  # one of these: vital ones are withheld if large, others at any size (0), until a trial
+        elif suspects:  # one of several: each is withheld, a vital one only if LARGE, until its trial
             for topic in suspects:
                 if len(self.withheld) < TOPICS:
                     self.withheld[topic] = Withheld(LARGE if self._is_vital(topic) else 0, now)

@@ -188,7 +188,7 @@ class MqttTransport(Transport):
     # -- the network thread
 
     def _run(self, run: _Run) -> None:
-        failures, stopping = 0, run.stopping  # failures in a row before this one: after the first there is no pause
+        failures, stopping = 0, run.stopping  # failures in a row without the newest: there is no pause after the first
         while not stopping.is_set():
             began, problem = time.monotonic(), "failed unexpectedly"
             try:
@@ -212,7 +212,7 @@ class MqttTransport(Transport):
             if self._dialler.addresses.several and not self._dialler.addresses.is_over:
                 continue  # the next address
             pause = min(self.settings.reconnect_max_s, _RETRY_S * 2 ** (failures - 1)) if failures else 0.0
-            if not self._dialler.limits.asks_again:  # else it is asked in another way now: that is no failure yet
+            if not self._dialler.limits.asks_again:  # else it is asked in another way at once: no failure yet
                 failures = min(failures + 1, 20)  # bounded, because it is an exponent
             stopping.wait(pause * random.uniform(0.5, 1.0))  # noqa: S311  (jitter, no secret)
 
@@ -233,7 +233,7 @@ class MqttTransport(Transport):
         try:
             if self.settings.as_published:
                 is_granted = connection.incoming.as_published
-                if self.as_published and not is_granted:
+                if self.as_published and not is_granted:  # logged once, until it is granted again
                     log.warning("%s has no bridge mode: own messages come back on this connection", connection.where)
                 self.as_published = self.exact_echo = is_granted  # if not, own messages come back: no exact echo
             self._serve(connection, run)
@@ -245,7 +245,7 @@ class MqttTransport(Transport):
             self._keep_unconfirmed(connection)
 
     def _serve(self, connection: Connection, run: _Run) -> None:
-        tried_at = time.monotonic() + _TRIED_S  # only a connection that lasts so long shows the limits
+        tried_at = time.monotonic() + _TRIED_S  # a connection that ends sooner does not prove the broker's limits
         try:
             self._synchronize(connection, run.stopping)
             if earlier_failures := self._dialler.addresses.succeeded():
@@ -255,11 +255,11 @@ class MqttTransport(Transport):
                 if run.renewal:  # see renew_connection
                     connection.disconnect()
                     raise Lost(run.renewal)
-                if connection.limits is not self._dialler.reported and time.monotonic() > tried_at:
+                if connection.limits is not self._dialler.reported and time.monotonic() > tried_at:  # not logged yet
                     self._report_limits(connection)
-                if self._own.pending and connection.has_room:
+                if self._own.pending and connection.has_room:  # retained messages that were not sent yet
                     self._sync_retained(self._own.keys())
-                if self._refused.withheld:
+                if self._refused.withheld:  # topics that are not sent, as the broker hangs up on them
                     self._try_withheld(connection)
         except Lost as lost:
             self._note_loss(connection, lost)
@@ -316,14 +316,14 @@ class MqttTransport(Transport):
         with self._publishing:
             messages = {topic: message for topic, message in self._own.items() if topic not in self._own.pending}
             not_accepted = {topic for topic, message in messages.items() if not self._accepts(connection, message)}
-            may_differ = self._own.shared | not_accepted  # there it may: others publish, too, or ours is refused
+            may_differ = self._own.shared | not_accepted  # others publish there, too, or the broker refuses ours
         retained = self._find(connection, list(messages), stopping)
         if self.will is not None and retained.get(self.will.topic) == self.will.payload:
             del retained[self.will.topic]  # our own will, published although we were running
         differing = {topic for topic, payload in retained.items() if payload != messages[topic].payload}
         older = differing - may_differ
         self.went_back = bool(older)
-        return retained.keys() - older  # an older one is replaced by ours
+        return retained.keys() - older  # without older ones, as ours replace them
 
     def _find(self, connection: Connection, topics: list[str], stopping: threading.Event) -> dict[str, bytes]:
         """Return the payloads that the broker retains on these topics."""
@@ -385,7 +385,7 @@ class MqttTransport(Transport):
         subscriptions = list(self._subscriptions)
         for filter_, is_refused in refused.items():
             for subscription in subscriptions:
-                if overlap(subscription.filter, filter_):  # of the broker's filters only the one that covers it does
+                if overlap(subscription.filter, filter_):  # then it is the broker's filter that covers the subscription
                     subscription.refused = is_refused
 
     def note_refusal(self, topic: str, why: str) -> None:

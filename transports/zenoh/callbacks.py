@@ -116,7 +116,7 @@ class Guard:
             active = active or runs or begun != calls.begun_before
             if runs and calls.ran:  # at both looks: one that takes long, or many without a pause
                 self._help()
-            self._suspects = self._suspects or runs
+            self._suspects = self._suspects or runs  # then `_run` looks again soon
             calls.begun_before, calls.ran = begun, runs
         return active
 

@@ -16,7 +16,7 @@ from pebble.transports.zenoh.wire import LIVE, SYNC, UP
 log = logging.getLogger(__name__)
 
 _ASK_AGAIN_S = 0.05  # a sibling that was connected after the query was sent has not received it
-_PAUSE_S = (0.001, 0.02)  # between queries, first and longest
+_PAUSES_S = (0.001, 0.02)  # between queries, first and longest
 _LOST_SESSIONS_LIMIT = 1000  # sessions whose return would be noticed
 
 
@@ -114,7 +114,7 @@ class Barrier:
         Return how many retained messages each of them has sent, by name.
         """
         end = time.monotonic() + timeout
-        pause, longest = _PAUSE_S
+        pause, longest = _PAUSES_S
         answers: dict[str, int] = {}
         while missing := self._missing(expected(), answers):
             remaining_s = end - time.monotonic()

@@ -49,7 +49,7 @@ class ZenohTransport(Transport):
         self._elsewhere = bool(settings.client and settings.connect)  # its hub and siblings are on other machines
         self._connecting = threading.RLock()  # held while subscribing, and while a connection is made
         self._subscribers: dict[Subscription, zenoh.Subscriber[None]] = {}
-        self._publishers = Publishers(lambda topic: self.policy.is_invented(topic))  # set later, see TopicPolicy
+        self._publishers = Publishers(lambda topic: self.policy.is_invented(topic))  # its owner sets policy later
         self._hub = HubConnection(client_id, will, self._own, self.count_received, settings.account)
         self._reset()
 
@@ -200,7 +200,7 @@ class ZenohTransport(Transport):
         """Process a change of hubs or connections; return the serial number of the working hub connection, 0 for none.
 
         The number grows with each hub that appears. ``linked``: the result of the last call, or 0 after an error;
-        ``seen``: the version of that call's view. If ``view`` is of the same version, only a failed try is repeated.
+        ``seen``: the version of that call's view. With the same version nothing has changed: a failed try is repeated.
         """
         if not view.hubs:
             self.problem = f"the hub of {self.settings.run_dir} is away"
@@ -221,7 +221,7 @@ class ZenohTransport(Transport):
             return False
         self._refresh()
         self._set_state(State.CONNECTED)
-        self._send_lacking(session, set())  # only what became pending meanwhile: the hub lacks nothing else
+        self._send_lacking(session, set())  # set(): only what became pending since _send_hello has sent the rest
         return True
 
     def _send_hello(self, session: zenoh.Session) -> bool:
@@ -272,8 +272,8 @@ class ZenohTransport(Transport):
         try:
             if message.retain:
                 self._hub.put(session, message, again=self._own.syncing)
-            # While `syncing`, messages that siblings have received before are sent to the hub again. Only a client's
-            # pending messages are new to others, which it reaches through the hub.
+            # While `syncing`, siblings have received these messages before: only the hub gets them again. But what a
+            # client has pending is new to all, as it reaches others through the hub alone.
             if not self._own.syncing:
                 self._publishers.put(session, message, urgent)
             elif self.settings.client and message.topic in self._own.pending:
@@ -307,26 +307,26 @@ class ZenohTransport(Transport):
             with contextlib.suppress(zenoh.ZError):  # closed meanwhile
                 subscriber.undeclare()  # type: ignore[no-untyped-call]
 
-    def _make_subscriber(self, session: zenoh.Session, subscription: Subscription) -> None:
+    def _make_subscriber(self, session: zenoh.Session, subscription: Subscription) -> None:  # unless it has one
         if subscription in self._subscribers:
             return
         origin = zenoh.Locality.ANY if subscription.echo else zenoh.Locality.REMOTE
-        only_topic = None if is_pattern(subscription.filter) else subscription.filter
-        may_be_ours = subscription.direct and subscription.echo
+        only_topic = None if is_pattern(subscription.filter) else subscription.filter  # None: it matches many
+        may_be_ours = subscription.direct and subscription.echo  # then the handler must not run inside our put()
         late_s, publishers = self._ages.late_s, self._publishers
 
         def take(sample: zenoh.Sample) -> None:
             self.count_received()
             read_at = clock.since_boot()
             stamp = wire.read_live(sample.attachment)
-            # A sender of this boot shares our clock: the age is known. Only if it is high, or unknown, ask `_is_late`.
+            # since: when it was sent; None if its sender does not share our clock. If long ago or None, ask `_is_late`.
             since = stamp.sent_ns / 1e9 if stamp.boot == wire.BOOT else None
             if (since is None or read_at - since > late_s) and self._is_late(sample, stamp, read_at):
                 return
             topic, payload = only_topic or key_to_topic(str(sample.key_expr)), sample.payload.to_bytes()
             qos = min(stamp.qos, subscription.qos)
             message = Message(topic, payload, qos, False, stamp.retain_requested, read_at if since is None else since)
-            if may_be_ours and publishers.thread == threading.get_ident():  # inside put(), see LoopbackQueue
+            if may_be_ours and publishers.thread == threading.get_ident():  # this thread is inside put()
                 self._loopback.put(subscription, message)
             else:
                 subscription.offer(message)

@@ -77,7 +77,7 @@ def _transport(reader: Reader, transport: TransportSection, path: Path) -> Trans
 
 def _bridge(reader: Reader, bridge: MqttBridge, path: Path) -> MqttBridge:
     notes, remote, link = reader.notes, bridge.remote, bridge.link
-    for section, command_of_unit in _COMMANDS_OF_UNIT.items():  # what to write for our unit of systemd
+    for section, command_of_unit in _COMMANDS_OF_UNIT.items():  # warns of commands taken over from the original
         words = " ".join(getattr(bridge, section).command)
         reasons = [reason for occurs_in, reason in _WORDS_OF_ORIGINAL if occurs_in(words)]
         if bridge.enabled and reasons:
@@ -122,7 +122,7 @@ def _without_uplink(notes: Notes, root: Root) -> Root:
     return replace(root, services=replace(root.services, mqtt_bridge=bridge))
 
 
-def _serial(reader: Reader, serial: SerialBridge, path: Path) -> SerialBridge:
+def _serial(reader: Reader, serial: SerialBridge, path: Path) -> SerialBridge:  # each line: its own port and name
     if "instances" in path:  # the section of an instance
         if serial.instances:
             reader.notes.problem((*path, "instances"), "must be left out: an instance has none")
@@ -135,7 +135,7 @@ def _serial(reader: Reader, serial: SerialBridge, path: Path) -> SerialBridge:
         port = line.serial.port
         if not line.enabled:
             continue
-        if port is None:
+        if port is None:  # a doubt: it may have been refused, which is noted already
             reader.notes.doubt((*place, "serial", "port"), "is missing, write the device: ls /dev/serial/by-id/*")
         elif port in ports:
             reader.notes.problem(place, f"shares {port} with {ports[port]}, write another serial.port")

@@ -94,7 +94,10 @@ class Legs:
         return self._drive(name, (0.0, math.copysign(POWER, mm)), abs(mm) / self._mm_s, ends)
 
     def spin(self, name: str, turns: int) -> Counts:
-        """Spin ``turns`` on the spot; negative is clockwise. With a tag, the spin ends where it is seen as before."""
+        """Spin ``turns`` on the spot; negative is clockwise.
+
+        With a tag, the end of the spin is slow, until the robot sees the tag where it saw it before the spin.
+        """
         way_mm = abs(turns) * math.pi * self._expected.track_width_mm  # of each wheel
         side = -math.copysign(1.0, turns)  # as drive commands have it: positive turns to the right
         fast_mm = way_mm if self._finder is None else way_mm * _BEFORE_TAG
@@ -111,7 +114,7 @@ class Legs:
             slow_mm_s = self._mm_s * _SLOW_POWER / POWER
             slow_s = way_mm / abs(turns) / slow_mm_s  # that a whole turn takes
             why_late = f"it does not see tag {self._tag_id} again"
-            for direction in (side, -side):  # back, if it has rolled past
+            for direction in (side, -side):  # the other way if it has rolled past the tag
                 self._drive(name, (direction * _SLOW_POWER, 0.0), slow_s, lambda _: self._is_at(start), why_late)
                 if self._sees():
                     break

@@ -98,7 +98,8 @@ class _Session:
             camera = CameraModel.find([robot.config.folder])
             self._legs.watch(TagFinder(wanted.tag_size_m, camera, wanted.family), wanted.tag)
         kinds = [self._straight] * wanted.straights + [self._spin] * wanted.spins
-        #: The method of each run, and its sign, in turns: 1 (there, or left), -1 (back, or right). Straights are even.
+        #: The method of each run, and its sign, in turns: 1 (there, or left), -1 (back, or right). The number of
+        #: straights is even (`check`): runs 0 and 1, 2 and 3, and so on, are pairs of them. So spins begin with 1, too.
         self._drives = [(drive, 1 if number % 2 == 0 else -1) for number, drive in enumerate(kinds)]
         self.runs: list[Run] = []
 
@@ -116,8 +117,8 @@ class _Session:
             repeats[worst] += 1
             self._person.tell(f"{name} is {off}, more than {LIMIT_SIGMA:g}: it is repeated")
             first, last = worst, worst
-            if self.runs[worst].mm is not None:  # a straight one: there and back, so that it ends where it began
-                first = worst // 2 * 2
+            if self.runs[worst].mm is not None:  # a straight one: its whole pair, so that it ends where it began
+                first = worst // 2 * 2  # the even number of the pair
                 last = first + 1
             for number in range(first, last + 1):
                 self.runs[number] = self._drive(number)
@@ -194,7 +195,7 @@ class _Session:
         if self._wanted.truth == "tape":
             what += " and mm to the left of it (right: minus), such as 1497 -12"
             along, aside = self._numbers(what, 2, is_plausible)
-            return arc(sign * along, aside)  # without the sign: left of the heading, also when it drives back
+            return arc(sign * along, aside)  # `aside` counts to the left of the heading, also when it drives back
         half_turn = self._gyro(counts) / 2  # the direction of an arc's end, from the first heading
         (along,) = self._numbers(what, 1, is_plausible)
         return arc(sign * along, sign * along * math.tan(half_turn))

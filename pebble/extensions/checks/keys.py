@@ -63,15 +63,15 @@ def _meaning(field: FieldInfo) -> str:
 
 
 def _allowed(field: FieldInfo) -> str:
-    """Return the kind of value in words; empty where the key's meaning shows it."""
+    """Return in words which values a key accepts; empty for a boolean or a text about which the metas add nothing."""
     kind, metas = unwrap(field.type)
     if get_origin(kind) is tuple:
         return " A list."
     if get_origin(kind) is dict:
         return " An object."
-    # What else is said of the values, such as "choices" and "expected"; "parse" is a function that reads them.
-    limits = [name for meta in metas for name in meta.extra or () if name != "parse"]
-    if kind in (bool, str) and not limits:
+    # What the metas add, such as "choices" and "expected", but not "parse": the function that reads the values.
+    added = [name for meta in metas for name in meta.extra or () if name != "parse"]
+    if kind in (bool, str) and not added:
         return ""
     text = expected(kind, metas).partition(":")[0]  # of "a topic: 1 to 250 …" only "a topic"
     return f" {text[:1].upper()}{text[1:]}."

@@ -56,7 +56,7 @@ def who_drives(config: Config) -> Iterator[CheckResult]:
         yield warn(warning, f"pebble fleet init FOLDER --host NAME; pebble fleet add {config.robot.id} --role robot")
         return
     yield ok(f"level {level}: it is driven by {_DRIVERS[level]}")
-    folder = _fleet_folder(config) if level != "open" else None  # open, but only to this machine
+    folder = _fleet_folder(config) if level != "open" else None  # without accounts: only this machine reaches it
     if folder is not None:
         try:
             yield ok(_accounts(load(folder)), what=_WHO)

@@ -170,7 +170,7 @@ def _reload(folder: Path) -> str:
             process = os.pidfd_open(pid)
             try:
                 if _is_broker(pid):  # and no other process that has got its number meanwhile
-                    if not _handles_signal(pid):
+                    if not _handles_signal(pid):  # not yet: it has just started
                         raise FleetError(f"mosquitto (process {pid}) would end by SIGHUP: give this command again")
                     signal.pidfd_send_signal(process, signal.SIGHUP)
             finally:

@@ -61,13 +61,16 @@ class Audit:
     def write(
         self, what: str, *, ref: str = "", user: str = "", device: str = "", address: str = "", detail: str = ""
     ) -> None:
-        """Add a row. What strangers, or many pages at once, may cause has fewer different rows a minute."""
+        """Add a row, or only count it if a similar one was added in this minute (`RowWriter.add`).
+
+        What strangers, or many pages at once, may cause has fewer different rows a minute: at most OF_STRANGERS.
+        """
         fields = zip(_FIELDS, (ref, user, device, address, detail), strict=True)
         texts = {field: text[:_MAX_TEXT].encode(errors="replace").decode() for field, text in fields}
         refused = what in REFUSED
-        like = (what, network_of(address)) if refused else None  # refusals of one network share a row
+        shared_key = (what, network_of(address)) if refused else None  # refusals of one network share a row
         most_different = OF_STRANGERS if refused or what in MILD else DIFFERENT
-        self._writer.add({"t": time.time(), "what": what, **texts}, like, most_different)
+        self._writer.add({"t": time.time(), "what": what, **texts}, shared_key, most_different)
 
     def read(self, limit: int, ref: str = "") -> list[Entry]:
         """Return the newest rows, the newest last. ``ref``: those of one robot and of all robots.

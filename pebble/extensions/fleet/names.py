@@ -83,14 +83,14 @@ class CheckedNames(Names):
         if fields is not None:
             body = _body(fields)  # the same object, or its ``value``
             claim = body.get("by")
-            if account != NO_ACCOUNT and isinstance(claim, str) and claim:
+            if account != NO_ACCOUNT and isinstance(claim, str) and claim:  # a page server names its person
                 by = _with_person(account, claim[:_LONGEST])
             if payload_type not in _UNSIGNED:
                 fields.pop("by", None)  # also a claim outside of ``body``
                 body["by"] = by
                 payload = _encoder.encode(fields)
         elif channel is not None and payload_type not in _MAY_BE_BARE:
-            return Drop.UNREADABLE  # it is no object
+            return Drop.UNREADABLE  # of such a type only an object is a command
         return Signed(_moved(message, sender.topic, payload), by)
 
 

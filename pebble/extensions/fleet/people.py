@@ -78,9 +78,9 @@ class People:
         self._database = Database(path, _TABLES)
         self._removed = ""  # the error that was logged last, if the file was removed
         self._log = RateLimitedLog(log, period_s=60.0)
-        #: By token: what the file said of the session when it could be read last, and when that session ends. A session
-        #: counts as one byte, so the limit in bytes is one for the tokens.
-        self._seen = BoundedTable[tuple[Session, float]](_SESSIONS, _SESSIONS << 10, lambda _: 1)
+        #: By the token's SHA-256: what the file said of the session when it could be read last, and when that session
+        #: ends. Only their number is limited: the limit in bytes, 1 KiB for each, is far above a digest in hex.
+        self._seen = BoundedTable[tuple[Session, float]](_SESSIONS, 1024 * _SESSIONS, lambda _: 1)
         self._clock = clock
         self._addresses, self._names = Tries(monotonic), Tries(monotonic)  # counts of failed logins
         self._no_hash = _no_hash()  # compared where the name is unknown, so that this takes as long

@@ -61,7 +61,8 @@ _COMMANDS: dict[str, Callable[[Any], Row]] = {
     LIGHTS_FLASH.suffix: lambda colour: _lights_row(colour),
     OUTLET_COMMAND.suffix: lambda request: {"what": "outlet", "on": request.on},
 }
-_MILD = (SOUNDBOARD_COMMAND, LIGHTS_SOLID, LIGHTS_FLASH)  # their rows take no room that others need
+#: Harmless commands: after OF_STRANGERS different rows in a minute theirs are only counted, so that others have room.
+_MILD = (SOUNDBOARD_COMMAND, LIGHTS_SOLID, LIGHTS_FLASH)
 
 
 def files(config: Config) -> list[Path]:
@@ -78,7 +79,7 @@ class Audit(Observer):
         self._level = config.security.level
         self._writer, self._clock = RowWriter(self._append, clock), clock
         self._holder: ControlState | None = None  # None: not known yet
-        self._owners, self._awaited = config.motor_owners, set[str]()  # those that have not answered the newest reset
+        self._owners, self._awaited = config.motor_owners, set[str]()  # awaited: their answer to the newest reset
         self._refusals = dict[str, str | None]()  # by owner: why it has refused its last reset, if it has
         self._stops = deque[tuple[str, str]](maxlen=_REMEMBERED)  # those that have a row: name and sender
         self._lights = dict[tuple[str, bool], float]()  # when each sender last sent lights, on or off
@@ -139,14 +140,16 @@ class Audit(Observer):
                 self.note(what, who, id=holder.id, device=holder.device)
 
     def estop(self, owner: str, state: EstopState) -> None:
-        """Add a row if the owner has refused a reset; its state shows only why it has refused the last one."""
+        """Add a row if the owner has refused a reset. All its states say why it has refused the last one, if it has."""
         why = state.reset_refused
-        before = self._refusals.get(owner, why)  # the first state that is seen may tell of an old refusal
+        if owner not in self._refusals:
+            self._refusals[owner] = why  # the first state that is seen may tell of an old refusal: it is no news
+        is_news = why != self._refusals[owner]
         is_answer = owner in self._awaited  # to the newest reset that passed here
         is_of_another = why == "boot" and len(self._owners) > 1  # a reset is for one owner's boot: all others refuse it
         self._refusals[owner] = why
         self._awaited.discard(owner)
-        if why and (is_answer or why != before) and not is_of_another:
+        if why and (is_answer or is_news) and not is_of_another:
             self.note("reset-refused", owner=owner, why=why)
 
     def unconfirmed(self, owner: str, stop: EstopCommand) -> None:

@@ -279,7 +279,8 @@ def _of_expander() -> Iterator[Rule]:
     for channel in c.CHANNELS:
         if channel.kind is Kind.STREAM and channel.remote and channel.bridged and channel is not c.STREAMS:
             yield Rule("write", channel.filter(_ANY))
-    # How groups are written, the groups, and announcements with and without a name, by which only one expander works.
+    # It reads how groups are written, the groups, and the announcements of all expanders, also those with an account in
+    # the topic: they decide which one of several works.
     for suffix in (c.WIRE.suffix, c.STREAMS.suffix, c.EXPANDER.suffix, f"{INCOMING}/{BY}/+/{c.EXPANDER.metric}"):
         yield Rule("read", f"{_ANY}/{suffix}")
     yield Rule("read", f"{c.SHORT}+")  # the short topics of groups

@@ -40,19 +40,21 @@ def zenoh_text(fleet: Fleet) -> bytes:
 def _hub_account(account: Account, held: Iterable[Rule]) -> HubAccount:
     """Return an account's filters for wills and retained messages.
 
-    A robot may retain all that it may publish, and leave a will on its outgoing topics. Others may retain flags,
-    on topics without an account's name.
+    A robot may retain all that it may publish, and leave a will on its outgoing topics. Others may retain flags.
     """
     writes = [rule.filter for rule in held if rule.access == "write"]
     is_robot = ProgramRole.ROBOT in account.roles
     wills = [f"{base}/{OUTGOING}/#" for base in account.bases if is_robot]
     all_topics = [filter_ for filter_ in writes if is_robot and filter_.endswith("/#")]  # a robot's rule: {base}/#
-    flags = [filter_ for filter_ in writes if filter_.endswith(_FLAGS)]
+    flags = [filter_ for filter_ in writes if filter_.endswith(_FLAGS)]  # not those that end with an account's name
     return HubAccount(tuple(wills), tuple(dict.fromkeys((*wills, *all_topics, *flags))))
 
 
 def _grants(name: str, held: Sequence[Rule], retains: Iterable[str], *, is_hub: bool) -> Iterator[Grant]:
-    """Yield the grants that an account's client needs. It cannot act as a hub, or answer queries of others."""
+    """Yield the grants that an account's client needs. It cannot act as a hub, or answer queries of others.
+
+    ``held``: the account's rules; ``retains``: filters of the topics that it may retain.
+    """
     if is_hub:
         yield from EVERYTHING
         return

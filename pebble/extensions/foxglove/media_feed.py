@@ -228,6 +228,6 @@ class MediaFeed:
             self.refused += 1
             return
         data = stamped(converted.message, time_of(waiting.payload, waiting.at_ns))
-        if len(data) > MAX_BYTES:  # the server drops it
+        if len(data) > MAX_BYTES:  # the server drops it, and counts that; the problem tells users why they see nothing
             self._problem = f"{len(data)} bytes at once, more than {MAX_BYTES}: reduce size or quality"
         self._server.publish(f"{self._topic}/{converted.ending}", data, waiting.at_ns)

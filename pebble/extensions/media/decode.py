@@ -54,7 +54,7 @@ class VideoDecoder:
         except PebbleError as error:
             self.problem = str(error)
             self._reset()
-            self.wants_keyframe = isinstance(error, PayloadError)  # against a missing library a key frame does not help
+            self.wants_keyframe = isinstance(error, PayloadError)  # as in _reset, but not for a missing library
             return None
         self._last = header
         self.wants_keyframe = False

@@ -198,7 +198,7 @@ class JitterBuffer:
     def _next(self, now: float) -> Chunk | None:
         """Return the next packet's sound, or estimated sound for a gap before it; None if there is neither."""
         if not self._waiting:
-            if self._last is not None and not self._concealed:
+            if self._last is not None and not self._concealed:  # once: later calls have concealed something
                 self.counters.add("underruns")
             return self._conceal(self._budget_s)
         number = self._first()
@@ -257,13 +257,13 @@ class JitterBuffer:
         last = self._last
         if last is None:
             return None
-        allowed = round(self._budget_s * last.rate)
+        budget = round(self._budget_s * last.rate)  # samples, at whose end the sound has faded away
         remaining = round(min(gap_s, self._budget_s) * last.rate) - self._concealed
         size = min(remaining, round(_PIECE_S * last.rate))
         if size <= 0:
             return None
         estimate = self._estimated(last, size)
-        gain = 1.0 - (self._concealed + np.arange(len(estimate))) / allowed
+        gain = 1.0 - (self._concealed + np.arange(len(estimate))) / budget
         self._concealed += len(estimate)
         self.counters.add("concealed_ms", round(1000 * len(estimate) / last.rate))
         return Chunk(to_int16(estimate * gain[:, None]), last.rate, last.channels, concealed=True)
@@ -276,7 +276,7 @@ class JitterBuffer:
             estimate, self._spare = self._spare[:size], self._spare[size:]
             return estimate
         length = len(last.samples)
-        steps = (self._concealed + np.arange(size)) % (2 * length)  # on the way back and forth
+        steps = (self._concealed + np.arange(size)) % (2 * length)  # from the end of ``last`` back, then forth again
         return last.samples[np.where(steps < length, length - 1 - steps, steps - length)]
 
 
@@ -290,7 +290,7 @@ def _faded_in(samples: Samples, rate: int) -> Samples:
 def _faded_over(old: ReceivedSound, new: ReceivedSound) -> ReceivedSound:
     """Return ``new``, with its beginning faded over from ``old``."""
     size = min(len(old.samples), len(new.samples), round(_FADE_S * new.rate))
-    if (old.rate, old.channels) != (new.rate, new.channels) or old is new:  # the same: nothing was skipped
+    if (old.rate, old.channels) != (new.rate, new.channels) or old is new:  # old is new: nothing was skipped
         return new
     weight = np.linspace(0.0, 1.0, size)[:, None]
     samples = new.samples.copy()

@@ -25,7 +25,7 @@ def decode_jpeg(jpeg: bytes) -> Pixels:
 
     Bits flipped within the coefficients go undetected: JPEG has no checksum; TCP and zlib have.
     """
-    import cv2  # 16 MB, of which the size of a JPEG needs none
+    import cv2  # late: it takes 16 MB, and `jpeg_size` does without it
 
     width, height = jpeg_size(jpeg)
     # The picture as it was sent: turned as EXIF says, it would not fit the differences that follow.

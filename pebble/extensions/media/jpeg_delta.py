@@ -45,7 +45,7 @@ class JpegDelta:
         self._since_keyframe = 0 if self.keyframe else self._since_keyframe + 1
         # The last picture before a full one need not be decoded, as a full picture builds on nothing.
         is_last = self._since_keyframe + 1 >= self._interval
-        if self.keyframe or reference is None:
+        if self.keyframe or reference is None:  # the second implies the first, which mypy does not know
             jpeg = _jpeg(picture, quality)
             if not is_last:
                 self._reference = decode_jpeg(jpeg)

@@ -18,7 +18,7 @@ def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
 
 
 def _video(config: Config, addresses: Addresses) -> VideoOffer:
-    sent = config.section(Media).video_publisher  # `width`, `height`, `target_fps`, `fps`: where `publish_*` is not set
+    sent = config.section(Media).video_publisher  # its keys ``publish_*`` count before the others
     return VideoOffer(
         topic=addresses[c.CAMERA].topic,
         command_topic=addresses[c.VIDEO_CONTROL].topic,

@@ -48,7 +48,7 @@ class Resampler:
         """Compute the filter. ``_up`` output samples take as long as ``_down`` input samples."""
         common = gcd(rate, rate_out)
         self._up, self._down = rate_out // common, rate // common
-        widened = max(1.0, self._down / self._up)
+        widened = max(1.0, self._down / self._up)  # a lower rate passes less, which takes a longer filter
         self._taps = 2 * ceil(_CROSSINGS * widened)
         self._filter = _filter(min(self._up, _PHASES), self._taps, _PASS / widened)
         self._tail = np.zeros((self._taps - 1, channels), np.float32)

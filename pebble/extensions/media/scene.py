@@ -135,7 +135,7 @@ def _texture(grids: list[NDArray[np.float32]], rows: NDArray[np.float32], width:
 
 
 def _stretched(grid: NDArray[np.float32], rows: NDArray[np.float32], width: int) -> NDArray[np.float32]:
-    """Return the grid's values over the picture, linear between its points; the right edge meets the left one."""
+    """Return the grid's values at ``rows`` (0 to 1), linear between its points; the right edge meets the left one."""
     x = np.arange(width, dtype=np.float32) * grid.shape[1] / width
     y = rows * (grid.shape[0] - 1)
     left, top = x.astype(np.intp), y.astype(np.intp)

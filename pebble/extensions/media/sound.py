@@ -125,11 +125,11 @@ def make_sound_encoder(
     numbers = sequence_numbers() if numbers is None else numbers
     rate_out, channels_out = sent_rate or rate, sent_channels or channels
     if name == "pcm":
-        rate_out = rate_out if rate_out <= _HEADER_LIMIT else opus.RATES[-1]  # the header holds no more
+        rate_out = rate_out if rate_out <= _HEADER_LIMIT else opus.RATES[-1]  # the header cannot hold it
         return SoundEncoder(_Intake(rate, channels, rate_out, channels_out), numbers, chunk_ms)
     if name == "opus":
         rate_out = next((opus_rate for opus_rate in opus.RATES if opus_rate >= rate_out), opus.RATES[-1])
-        intake = _Intake(rate, channels, rate_out, channels_out if channels_out <= 2 else 1)
+        intake = _Intake(rate, channels, rate_out, channels_out if channels_out <= 2 else 1)  # mono or stereo
         frame_ms = next((ms for ms in opus.FRAMES_MS if ms >= chunk_ms), opus.FRAMES_MS[-1])
         codec = OpusEncoder(rate_out, intake.channels, frame_ms=frame_ms, bitrate=bitrate)
         return SoundEncoder(intake, numbers, frame_ms, codec, min(max(bundle, 1), opus.BUNDLE_LIMIT))

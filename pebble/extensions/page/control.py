@@ -131,7 +131,7 @@ class Control:
         if "drive" in self._rights():
             server.drivers.restore(hello.token, self._tab)
         server.robots.join(self._interest)
-        self._interest.dirty |= {(ref, "web/driver") for ref in server.robots.components}  # not by `join`: see _flush
+        self._interest.dirty |= {(ref, "web/driver") for ref in server.robots.components}  # `join` leaves these out
         self._post(self._ping())
 
     def _end(self) -> None:
@@ -213,7 +213,7 @@ class Control:
         """Publish a command to a robot, once. It is not repeated; the robot's states show its effect."""
         if not self._may(robot_commands.right(op), op):
             return
-        why_not = self._why_not if robot_commands.moves(op) else ""
+        why_not = self._why_not if robot_commands.moves(op) else ""  # which forbids driving alone
         if why := why_not or self._server.drivers.refusals.of_op(op):
             self._refuse(op, why)
             return
@@ -264,10 +264,11 @@ class Control:
         if not self._may("reset", op) or robot is None:
             return
         reset = Reset(robot.estop, self._session.user)
-        known, reset.shown = reset.shown, {}  # refilled with the stops that the page has shown
+        newest = reset.shown  # by owner: the stops that are known here
+        reset.shown = {}  # and those that are reset: the same, with boot and count as the page has shown them
         for shown in op.owners:
-            if shown.owner in known:
-                reset.shown[shown.owner] = replace(known[shown.owner], boot=shown.boot, count=shown.count)
+            if shown.owner in newest:
+                reset.shown[shown.owner] = replace(newest[shown.owner], boot=shown.boot, count=shown.count)
         for message in reset.messages():
             self._server.broker.publish(message.topic, message.payload, qos=message.qos)
         self._audit("reset", op.ref)

@@ -143,9 +143,9 @@ class OpenComponents:
         """Return the callback for messages of a subscription of this component."""
 
         def take(message: Message, now: float) -> None:
-            meaning = self._wanted.get(ref, {}).get(filter_)
+            meaning = self._wanted.get(ref, {}).get(filter_)  # None: the topic's name shows component and channel
             aliases_before = self._robots.aliases(ref)
-            if meaning is None:  # the topic's name shows component and channel
+            if meaning is None:
                 self._robots.receive(message, now)
             elif meaning.channel.kind is c.Kind.FLAG:
                 self._receive_flag(ref, meaning.channel, message)
@@ -172,7 +172,7 @@ class OpenComponents:
     def _filters(self, ref: str) -> _Filters:
         """Return the topics of an open component: the contract's, those it names, and drawings over its picture.
 
-        A topic that has a meaning keeps it, unless it is that of a flag.
+        Of several meanings of one topic the first counts, but that of a flag in any case.
         """
         filters: _Filters = {channel.filter(ref): None for channel in WATCHED}  # None: the names tell the meaning
         for channel in _NAMED:

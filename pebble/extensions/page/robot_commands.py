@@ -60,7 +60,7 @@ def refusal(op: m.RobotOp, capabilities: dict[str, Any]) -> str:
     section, key = PLACES.get(command.channel, ("", ""))  # where the capabilities may name its topic
     if isinstance(op, m.ActionOp):
         described = (section_of(capabilities, section) for section in _sections(op))
-        offer = next(filter(None, described), {})
+        offer = next(filter(None, described), {})  # under the first of its possible names that is there
     elif isinstance(op, m.OutletOp):
         offer = _outlet_offer(capabilities, op.outlet)
     else:

@@ -82,8 +82,8 @@ class Interest:
     """A page's subscription: the values that it still needs, and the component that it has open."""
 
     def __init__(self, changed: Callable[[], None]) -> None:
-        self.watched = ""
-        self.dirty: set[tuple[str, str]] = set()
+        self.watched = ""  # the component that it has open; "": none
+        self.dirty: set[tuple[str, str]] = set()  # component and metric of each value that it still needs
         self.more = False  # what is dirty did not fit into the last message
         self.gone: set[str] = set()  # components that were removed since the last message
         self.notify = changed
@@ -100,7 +100,7 @@ class Robots:
         self.is_kept: Callable[[str], bool] = lambda _ref: False
         self.names: Mapping[str, str] = {}  # of components that may have none of their own
         self.omitted = 0  # messages of components, metrics and values beyond the limits
-        self.interests: set[Interest] = set()
+        self.interests: set[Interest] = set()  # of the connected pages
         #: Called with a component whose retained messages are not known here (any more).
         self.on_forget: Callable[[str], object] = lambda _: None
         self.logs: dict[str, LogLines] = {}  # of watched components
@@ -146,12 +146,12 @@ class Robots:
         dirty, interest.dirty = interest.dirty, set()
         taken: list[tuple[str, str, Any, float]] = []
         has_large, room = False, MAX_STATE_BYTES
-        for ref, metric in sorted(dirty, key=lambda key: key[0] != interest.watched):
+        for ref, metric in sorted(dirty, key=lambda key: key[0] != interest.watched):  # first what is watched
             stored = self._find(ref, metric)
             size = 0 if stored is None else len(bytes(stored.raw))
             is_large = size > LARGE_BYTES
             if room <= 0 or (is_large and (has_large or not large)):
-                interest.dirty.add((ref, metric))
+                interest.dirty.add((ref, metric))  # for the next message
                 continue
             has_large = has_large or is_large
             room -= size
@@ -227,7 +227,7 @@ class Robots:
             return
         if not message.payload:  # a removal, of which the robot's view has to learn as well: see _interpret
             self._remove_value(component, metric)
-        trimmed = codec.trim(message.payload)  # pages get it unchanged, inside a JSON message
+        trimmed = codec.trim(message.payload)  # without what may not be in a JSON message to pages
         if trimmed != message.payload:
             message = msgspec.structs.replace(message, payload=trimmed)
         if message.payload and not self._store(component, metric, channel, message, now):
@@ -259,7 +259,7 @@ class Robots:
         for component in self.components.values():
             waited_s = now - component.refreshed_at  # infinite: nothing was sent yet
             changed = component.robot.online(now) is not component.sent_online or waited_s == float("inf")
-            has_ages = component.robot.live or component.sent_online is not None  # else no age is known
+            has_ages = component.robot.live or component.sent_online is not None  # else nothing that grows older
             is_open = component.ref in opened
             if changed or (has_ages and is_open and waited_s >= _REFRESH_S):
                 self._refresh(component, now)
@@ -277,7 +277,10 @@ class Robots:
             self._mark(component.ref, c.ONLINE.metric)
 
     def _add(self, ref: str) -> Component | None:
-        """Add a component; None if the table is full. A wanted one replaces the newest that need not be kept."""
+        """Add a component; None if the table is full.
+
+        A wanted one replaces the newest that need not be kept; where all are kept, it is one more.
+        """
         if len(self.components) >= MAX_COMPONENTS:
             if not self.omitted:
                 log.warning("more than %d components at this broker: give it accounts", MAX_COMPONENTS)
@@ -287,7 +290,7 @@ class Robots:
             newest = next((other for other in reversed(self.components) if not self.is_kept(other)), None)
             if newest is not None:
                 self.forget(newest)
-            self.on_forget(ref)  # its earlier messages found no place: they are asked for again
+            self.on_forget(ref)  # its earlier messages were omitted: the retained ones are asked for again
         component = self.components[ref] = Component(ref)
         return component
 
@@ -334,14 +337,14 @@ class Robots:
     def _interpret(self, component: Component, metric: str, channel: c.Channel, message: Message, now: float) -> None:
         """Update the view of the robot from a message that arrived at ``now``."""
         robot, capabilities_before = component.robot, component.robot.capabilities
-        received_at = time.time() - (time.monotonic() - now)
-        robot.receive(channel, message, now, received_at)
+        wall = time.time() - (time.monotonic() - now)  # the epoch time at ``now``, which is monotonic
+        robot.receive(channel, message, now, wall)
         if channel is c.MCU_DESCRIBE and message.payload:
             component.aliases[metric] = _aliases(message.payload)
         if robot.capabilities is not capabilities_before and "announced" in robot.capabilities:
             self.show_announced(component, now)
         if robot.liveness.reported_offline and component.sent_online is not False:
-            self._refresh(component, now)  # it may be back before the next round
+            self._refresh(component, now)  # at once: it may be back before the next `refresh`
 
     def show_announced(self, component: Component, now: float) -> None:
         """Send pages the capabilities that a component announces, or is assumed to have, until it publishes its own."""
@@ -374,6 +377,7 @@ class Robots:
         channel = _channel(metric)
         everybody = everybody or channel in FLEET
         for interest in self.interests:
+            # drawings over the picture of ``ref``, which this page shows for the component that it has open
             is_drawn = channel is c.VIDEO_OVERLAYS and self.sources.get(interest.watched) == ref
             if everybody or is_drawn or interest.watched == ref:
                 interest.dirty.add((ref, metric))

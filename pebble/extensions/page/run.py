@@ -38,7 +38,8 @@ def main(arguments: list[str]) -> int:
 def settings_or_all_problems(config: Config) -> WebSettings:
     """Return the settings of the page. Raises ConfigError.
 
-    The error names all problems at once, also a missing user. That alone is no error here: callers look for users.
+    The error names all problems at once, also that no user exists. Without another problem that is no error here:
+    callers check it themselves.
     """
     try:
         return settings_of(config)

@@ -129,16 +129,16 @@ class Server:
         self._send(self.stops.receive(message, clock()))
         if ref not in self.robots.components:
             return
-        # a heartbeat changes no stop: it only brings the state of a robot's stop to pages that have none yet
+        # a heartbeat changes no stop: after one, pages need the stop's state only if they have none of it yet
         if address.metric != ONLINE.metric or self.robots.value(ref, _ESTOP_METRIC) is None:
             self.stops.changed.add(ref)
         if channel_of(f"outgoing/{address.metric}") in (CAPABILITIES, CONTROL_STATE):
             self.drivers.updated(ref)
         if address.metric == CAPABILITIES.metric:
             self.open_components.update(ref)
-            for page, source in list(self.robots.sources.items()):
-                if source == ref:  # it shows this component's picture, with the overlays over it
-                    self.open_components.update(page)
+            for shown, source in list(self.robots.sources.items()):
+                if source == ref:  # where ``shown`` is open, pages show the picture of ``ref``, with its overlays
+                    self.open_components.update(shown)
 
     def _ask_anew(self, _ref: str) -> None:
         """Subscribe again to get this robot's retained messages once more."""

@@ -147,7 +147,7 @@ class Stops:
         for stop in [self._by_ref[key] for key in (ref, "") if key in self._by_ref]:
             if not stop.is_over or now - stop.pressed_at < COLLECT_S:  # an ended stop may yet be confirmed
                 stop.sender.receive(message, now)
-                messages += stop.sender.tick_robot(ref, now, again=self._repeats)
+                messages += stop.sender.tick_robot(ref, now, again=self._repeats)  # False: only a first message
                 self._note_progress(stop, ref)
         return messages
 

@@ -38,8 +38,8 @@ class _Paho(paho.Client):
     def _sock_recv(self, bufsize: int) -> bytes:
         """Return bytes that `PahoClient.receive` took out of the socket, from which paho itself reads nothing."""
         if self.begin == len(self.ahead):
-            raise BlockingIOError
-        if self._too_long:  # discard what paho has collected of the packet after its head
+            raise BlockingIOError  # as an empty socket does, so that paho waits
+        if self._too_long:  # discard what paho has collected of the packet that arrives, after its head
             del self._in_packet["packet"][HEAD:]
         data = self.ahead[self.begin : self.begin + bufsize]
         self.begin += len(data)
@@ -152,7 +152,7 @@ class PahoClient:
             self.close()
         # With TLS the number of unpacked bytes does not tell whether the socket has more.
         self.drained = not data or (len(data) < _PIECE and self._context is None)
-        self._paho.ahead, self._paho.begin = data, 0
+        self._paho.ahead, self._paho.begin = data, 0  # paho reads these bytes, from the first one on
         return len(data)
 
     owes = False  # paho acknowledges as it reads

@@ -79,7 +79,7 @@ def _read_summary(info: FileInfo, file: RecordingFile, statistics: Any) -> None:
 def _read_all(info: FileInfo, file: RecordingFile, since_ns: int, until_ns: int) -> None:
     """Add the file's messages of this period to ``info``, which must have none."""
     for message in file.read(since_ns=since_ns, until_ns=until_ns):
-        if since_ns <= message.log_ns < until_ns:
+        if since_ns <= message.log_ns < until_ns:  # `read` leaves out only whole chunks
             if not info.messages:
                 info.first_ns = message.log_ns
             info.last_ns = message.log_ns
@@ -131,6 +131,7 @@ class Query:
 def check_names(query: Query, paths: Iterable[Path], places: Iterable[Path]) -> None:
     """Raise RecordingError if no recording of ``places`` has the robot or topic of the query: it may be mistyped.
 
+    ``paths`` are the files there; the error names ``places``, as the user has named them.
     If a file cannot be read completely, its names are unknown; then nothing is raised, since the file's problem is
     reported.
     """
@@ -146,7 +147,8 @@ def check_names(query: Query, paths: Iterable[Path], places: Iterable[Path]) -> 
         except RecordingError:
             return
     robots = robots_of(channels)
-    if query.robot not in [*map(composed, robots)]:  # check_name lets None pass
+    names_as_typed = [composed(robot) for robot in robots]
+    if query.robot is not None and query.robot not in names_as_typed:
         check_name("robot", query.robot, robots, places)
     topics = {channel.topic for channel in channels if query.robot is None or is_of(channel.topic, query.robot)}
     for filter_ in query.topics:

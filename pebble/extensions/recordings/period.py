@@ -81,8 +81,8 @@ def _until(text: str, since_ns: int | None, now: datetime) -> int:
         return _moment("--until", text, now, days=1)
     if since_ns is None:
         return _latest("--until", text, now)
-    # Without a zone in ``now``, astimezone gives ``since`` the offset that this machine had then. ``replace`` removes
-    # it, because ``moment`` may have another one, after a change to summer time.
+    # If ``now`` has no zone, astimezone(None) gives ``since`` a fixed offset, this machine's at that time. ``replace``
+    # removes it: ``moment`` may come after a change to summer time, and then has another one.
     since = (_EPOCH + timedelta(microseconds=since_ns // 1000)).astimezone(now.tzinfo).replace(tzinfo=now.tzinfo)
     moment = _time_of_day("--until", text, since)
     return _ns(moment if moment > since else moment + _DAY)

@@ -30,11 +30,12 @@ _TRY_S = 0.005
 _EPOCH_S = 1_735_689_600  # 2025-01-01: counted from here, seconds fit into a run's number until 2059
 
 
-class LocalScripts:
-    """A lock that each script of this robot, or its manager, holds from before the script gets its run number.
+class LocalScriptsLock:
+    """A lock on a file: each script of this robot, or its manager, holds it from before the script gets a run number.
 
-    So a number that is taken while no script runs is older than the number of every later script. The kernel releases
-    the lock of a killed process.
+    A neighbour, which is another robot, takes the number for driving this robot while nothing holds the lock. So a
+    script of this robot that starts later has a newer number, and goes before the neighbour. The kernel releases the
+    lock of a killed process.
     """
 
     def __init__(self, config: Config) -> None:
@@ -44,7 +45,8 @@ class LocalScripts:
     def hold(self) -> None:
         """Lock the file while a script runs. The script runs even if this fails.
 
-        Where the system refuses the lock, :meth:`none_runs` does not get it either: no other robot may drive this one.
+        Where the system refuses the lock, it refuses it to :meth:`none_runs`, too. That then yields False, so no script
+        of a neighbour drives this robot: it would need a run number from here, which it gets only while none runs.
         """
         if self._held is None:
             try:
@@ -60,7 +62,10 @@ class LocalScripts:
 
     @contextmanager
     def none_runs(self) -> Iterator[bool]:
-        """Yield True if no script runs, and prevent one during the block; False if one runs, or that is unknown."""
+        """Yield True if no script runs, and prevent one during the block; False if one runs, or that is unknown.
+
+        If it yields False, no script of a neighbour may drive this robot.
+        """
         try:
             file = self._open()
         except OSError as error:

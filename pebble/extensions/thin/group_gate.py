@@ -64,7 +64,7 @@ def is_marked(raw: bytes) -> bool:
 
 
 class _Part(NamedTuple):
-    """A member of a group as a message of its own, with how it is forwarded, or why it is not."""
+    """A member of a group as a message of its own; ``way``: how it is forwarded, or why it is not."""
 
     member: groups.Member
     subject: Subject
@@ -136,7 +136,7 @@ class GroupGate:
         subject = self._subjects[topic]
         assert subject is not None  # noqa: S101 - its metric is that of a channel
         message = replace(message, topic=topic, payload=member.payload)
-        way = self._forwarder.admit(source, subject, message, topic, named=True)  # counted like those of an account
+        way = self._forwarder.admit(source, subject, message, topic, named=True)  # True: counted with those of accounts
         if self._forwarder.stays(topic):
             way = Drop.STAYS
         if isinstance(way, Forward):

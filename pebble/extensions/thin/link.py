@@ -52,6 +52,7 @@ class ShortestTrip:
         self._parts: deque[tuple[float, float]] = deque()  # when each began, and the shortest in it
 
     def note(self, seconds: float, now: float) -> None:
+        """Note a round trip. A part is forgotten once its last round trip, too, is older than _REMEMBERED_S."""
         began, shortest = self._parts[-1] if self._parts else (-inf, inf)
         if now - began >= _PART_S:
             self._parts.append((now, seconds))
@@ -73,7 +74,7 @@ class Crowd:
         self._contrary_since: float | None = None  # when measurements began to contradict ``stands``
 
     def note(self, queue_s: float, now: float) -> None:
-        """Note how much longer answers take than the fastest; after contradicting it for a time, change ``stands``."""
+        """Note how much longer answers take than the fastest; after some time of contradiction, change ``stands``."""
         contradicts = queue_s < _DRAINED_S if self.stands else queue_s > _STANDING_S
         if not contradicts:
             self._contrary_since = None

@@ -55,7 +55,8 @@ class Sieve:
         self._sent_at: dict[str, float] = {}  # by the topic of a stream, the oldest first
         self._ranks_that_wait: set[Rank] = set()  # those with a message that found no room
         self._event_waits_since = inf  # when `takes_event` first refused the event that waits; inf: none waits
-        self._event_was_refused = False  # `takes_event` has refused one since the last call of ``due(Rank.STATE)``
+        #: `takes_event` refused one since the last ``due(Rank.STATE)``: an overdue event still waits before the states.
+        self._event_was_refused = False
 
     def __len__(self) -> int:
         return len(self._waiting)
@@ -80,7 +81,8 @@ class Sieve:
             return False
         older = self._waiting.get(topic)
         if older is not None:
-            self._counters.add("thinned" if self._takes(rank, 0) else "shed")  # 0: it only asks for room
+            has_room = self._takes(rank, 0)  # for nothing: this only asks
+            self._counters.add("thinned" if has_room else "shed")
             self._waiting[topic] = Waiting(rank, subject, message, forward, older.since)
             return True
         if self._is_turn(rank, topic) and self._passes(rank, message):
@@ -101,7 +103,7 @@ class Sieve:
                 self._event_was_refused = False
                 self._ranks_that_wait.add(rank)
                 return
-            self._event_waits_since = inf  # no event was tried since the last call: it has left its buffer
+            self._event_waits_since = inf  # none waits: it would have been tried since the last call, and refused
         self._ranks_that_wait.discard(rank)
         overdue_since = self._clock() - OVERDUE_S
         for topic, entry in list(self._waiting.items()):

@@ -30,7 +30,10 @@ class Sifter:
         self._lock = threading.RLock()  # so that a message which has waited is not sent after a newer one
 
     def use(self, sieve: Sieve | None) -> None:
-        """Pass messages through ``sieve``, whose owner calls :meth:`send_waiting`; None: pass them at once."""
+        """Pass messages through ``sieve``, whose owner calls :meth:`send_waiting`; None: pass them at once.
+
+        Events wait in a buffer of their own (EventBuffer), which asks the sieve for room by ``has_room``.
+        """
         with self._lock:
             former, self._sieve = self._sieve, sieve
             self._way.pass_on = self._forwarder.pass_now if sieve is None else self._sift

@@ -54,10 +54,10 @@ class Action:
         self.name, self.control, self._cooldown_s = row.channel.metric, control, row.cooldown_s
         self._output = folder / f"{self.name.rpartition('/')[2]}.log"
         self._clock = clock
-        self._ran_at: float | None = None
+        self._ran_at: float | None = None  # when it was last started
         self._process: subprocess.Popen[bytes] | None = None
-        self._warned = False
-        self._log = RateLimitedLog(log, period_s=2.0)  # 3 actions with 4 subjects each: at most six lines a second
+        self._warned = False  # the log says that the config has no command for it
+        self._log = RateLimitedLog(log, period_s=2.0)  # 3 actions, each with 4 subjects: 12 lines in 2 s at most
 
     @property
     def running(self) -> bool:
@@ -84,7 +84,7 @@ class Action:
         import subprocess  # 0.4 MB of every robot's memory, for a command that few robots run
 
         self._log.log("running", logging.WARNING, "%s: running its command", self.name)
-        output, locked, where = None, None, f"is in {self._output}"
+        output, locked, where = None, None, f"is in {self._output}"  # where: what the log says of the output
         try:
             self._output.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             output = os.open(self._output, _NEW_FILE, 0o600)

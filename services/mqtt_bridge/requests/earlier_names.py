@@ -131,7 +131,7 @@ class EarlierNames:
 
     def __init__(self, config: Config, sides: list[Transport], call_in: CallIn) -> None:
         self._config, self._sides, self._call_in = config, sides, call_in
-        self._begun = config.path is None  # the search, which is made once
+        self._begun = config.path is None  # the search, made once; without a file, by which names are stored, never
 
     def begin(self) -> None:
         """Look for messages of earlier names. Call this when both sides are connected."""
@@ -199,10 +199,10 @@ class _Removal:
         for transport, topics in zip(self._sides, self._answers, strict=True):
             for topic in sorted(topics):
                 transport.publish(topic, b"", qos=QoS.DELIVERED, retain=True)
-        again = partial(self._ask, f"{self._name}/#", _note_retained, _ARRIVE_S, self._check)
+        again = partial(self._ask, f"{self._name}/#", _note_retained, _ARRIVE_S, self._note_remaining)
         self._call_in(_ARRIVE_S, again)
 
-    def _check(self) -> None:
+    def _note_remaining(self) -> None:
         remaining = [topic for topics in self._answers for topic in topics]
         remaining += [subscription.filter for subscription in self._subscriptions if subscription.refused]
         self._end()

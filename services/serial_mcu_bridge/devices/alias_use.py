@@ -56,7 +56,7 @@ class AliasUse:
 
     def _update(self, device: Device, route: Route, alias: Alias) -> None:
         """Use an alias, or release it while another device claims it or the config names another owner."""
-        owner = self._owners.get(alias.claim.partition("/")[2])
+        owner = self._owners.get(alias.claim.partition("/")[2])  # a claim is a channel with its direction before it
         rivals = self._peers.claimants(alias.claim)
         if owner is not None:
             rivals = [] if owner == device.uid else [owner]

@@ -81,11 +81,12 @@ class Device:
         )
 
     def alias_body(self, route: Route, sample: McuSample) -> Payload | None:
-        """Return ``sample`` as the payload of its interface's alias; None for a summary before the first motion sample.
+        """Return ``sample`` as the payload of its interface's :class:`Alias`; None if there is none yet.
 
-        A motion sample is stored as well, because summaries repeat the newest one.
+        An inertial sensor may have two interfaces: for samples of its motion, and for summaries, whose payloads repeat
+        the newest of these. So a sample of motion is stored as well, and a summary before the first one gives None.
         """
-        has_imu_body = route.alias is not None and route.alias.body != ""  # else the alias carries the generic payload
+        has_imu_body = route.alias is not None and route.alias.body != ""  # "": the generic payload
         if route.interface.profile == imu.MOTION and imu.fits(imu.MOTION, sample.value):
             motion = self._reports.motion(sample.t, sample.seq, sample.mcu_ms, sample.value)
             return motion if has_imu_body else sample
@@ -110,7 +111,7 @@ class Device:
         if self.claims.granted.get(claim) != interface.name:
             return None
         channel = self._robots_channel(claim)
-        if channel in (c.IMU_FAST, c.IMU):
+        if channel in (c.IMU_FAST, c.IMU):  # the contract has these, with the body of their profile
             return Alias(claim, channel, interface.profile)
         new_channel = _channel(interface.channel, interface.kind, payload, retain=interface.retain)
         # What must stay on the robot keeps the generic body: the MQTT bridge recognises it by the device named in it.

@@ -32,7 +32,10 @@ class LocalOnly(PrivateTopics):
         self._before_commands = f"{base}/{MCU_COMMAND.suffix.partition('{')[0]}"
 
     def stays(self, topic: str) -> bool:
-        """True if ``topic`` is on a list, is a command to an MCU without a list, or a request for a manifest."""
+        """True if ``topic`` is on a list, is a command to an MCU without a list, or a request for a manifest.
+
+        Only the robot's serial bridges send such requests, to each other. Values before a list are held by `admit`.
+        """
         if topic.startswith(self._before_commands):
             uid = topic.removeprefix(self._before_commands).partition("/")[0]
             if uid not in self._listed or topic.endswith(_DESCRIBE):
@@ -61,7 +64,8 @@ class LocalOnly(PrivateTopics):
         except PayloadError:
             return
         if uid in self._private or len(self._private) < _DEVICES:
-            usable = (topic for topic in listed.topics if not is_reserved(topic.partition("/")[2]))  # a stop must pass
+            # A list cannot hold back a stop, or what else is reserved. [2]: the metric, without incoming/ or outgoing/.
+            usable = (topic for topic in listed.topics if not is_reserved(topic.partition("/")[2]))
             self._private[uid] = frozenset(f"{self.base}/{topic}" for topic in usable)
             self._listed.add(uid)
 
@@ -85,7 +89,9 @@ class LocalOnly(PrivateTopics):
         if message.topic.startswith(self._before_values):
             uid = message.topic.removeprefix(self._before_values).partition("/")[0]
             return None if message.topic.endswith(_DESCRIBE) else uid
-        sample = _object(message.payload) if _MARK in message.payload else {}  # of an alias: the uid is inside
+        if _MARK not in message.payload:
+            return None
+        sample = _object(message.payload)  # a value under an alias: its topic has no uid, its payload has
         sender = sample.get("device_uid")
         return sender if isinstance(sender, str) and isinstance(sample.get("interface"), str) else None
 

@@ -33,7 +33,7 @@ class Output:
 
     def write(self, port: Port, now: float, *, ready: bool) -> None:
         """Write until the kernel accepts no more; lines from the outbox are written only to a ``ready`` device."""
-        while self.sending or (ready and self.outbox.waiting and self._next_line(port, now)):
+        while self.sending or (ready and self.outbox.waiting and self._next_line(port, now)):  # it sets `sending`
             sent = port.write(self.sending)
             if not sent:
                 return

@@ -121,12 +121,13 @@ class Session:
         self._base = base
         self._splitter = LineSplitter(FRAME_LIMIT, END)
         self._too_long = 0  # frames that were too long, as far as they were reported
-        self._by_id: dict[int, Interface] = {}
-        self.known: OrderedDict[Hello, Manifest] = OrderedDict()
+        self._by_id: dict[int, Interface] = {}  # the interfaces of the manifest
+        self.known: OrderedDict[Hello, Manifest] = OrderedDict()  # manifests that need not be requested again
         self._commands: OrderedDict[int, _Command] = OrderedDict()  # without an answer yet; the first is due first
-        self._slots: dict[str, int] = {}  # by interface, or "group": the newest command's slot, below WAITING
+        self._slots: dict[str, int] = {}  # by interface, or "group": its newest command's slot, see :meth:`commands`
         self._sequence = 0  # the number of our newest frame
         self._ask_at: float | None = None  # when to ask for the manifest; None: it is known, or there is no line
+        # When the last frame came, and when the last ping and the last request for the manifest were sent.
         self._received_at = self._pinged_at = self._asked_at = float("-inf")
 
     @property
@@ -197,6 +198,7 @@ class Session:
         return Send(f"command {kind}/{slot}", data)
 
     def _receive(self, stuffed: bytes, now: float) -> Iterator[Event]:
+        """Yield the events of a frame. One with a refused payload ends the silence, but does not count as valid."""
         try:
             frame = decode(stuffed)
             self._received_at = now
@@ -244,7 +246,7 @@ class Session:
         if len(self.known) > _REMEMBERED:
             self.known.popitem(last=False)
         if manifest == self.manifest:
-            self._ask_at = None  # nothing has changed, so the doubt is over
+            self._ask_at = None  # the present manifest is right: no further request
             return
         yield from self._forget("its manifest differs")
         yield from self._begin(Described(manifest))

@@ -19,7 +19,7 @@ from pebble.config.raw import deep_merge
 from pebble.contract import DRIVE, ESTOP_STATE, FROM_NEIGHBOUR, NEIGHBOURS, WHEEL_ODOMETRY, codec
 from pebble.contract.payloads import SCRIPT, Drive, EstopState, Neighbours, WheelOdometry
 from pebble.errors import ConfigError, PebbleError
-from pebble.extensions.scripts.runs import LocalScripts
+from pebble.extensions.scripts.runs import LocalScriptsLock
 from pebble.extensions.scripts.script import NotGrantedError, Robot, Stopped
 from pebble.extensions.scripts.script.neighbour import PRESENT_S
 from pebble.motion.arbiter import PERSON, Arbiter
@@ -185,7 +185,7 @@ def test_what_is_no_command_of_a_running_script_moves_nothing(pair: Pair) -> Non
     pair.lan.behind_s = 0.6
     pair.send(signed)
     pair.lan.behind_s = 0.0
-    local = LocalScripts(pair.fred.config)
+    local = LocalScriptsLock(pair.fred.config)
     local.hold()
     pair.send(signed)
     assert until(lambda: "its own" in str(pair.fred.state.refused))

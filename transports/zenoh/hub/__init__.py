@@ -47,7 +47,7 @@ class ZenohHub:
             from pebble.transports.credentials import renewed_context  # ssl, which few hubs need
 
             self._certificates = renewed_context(settings.tls)
-        self._used = self._newest  # by the session: certificates and rules; before it opens, those in the files
+        self._used = self._newest  # certificates and rules of the session; before it opens, those in the files
 
     @property
     def refused_wills(self) -> int:
@@ -125,7 +125,7 @@ class ZenohHub:
 
     def _listen(self, worker: HubWorker) -> None:
         self._session = None
-        siblings = PeerRegistry(self._settings.run_dir).sockets()  # to connect to: their next try may be 0.5 s away
+        siblings = PeerRegistry(self._settings.run_dir).sockets()  # to connect to them: their next try may take 0.5 s
         try:
             settings = replace(self._settings, listen=tuple(filter(self._is_free, self._settings.listen)))
             rules = self._admission.rules()

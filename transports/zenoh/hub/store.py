@@ -82,7 +82,7 @@ class HubStore:
         name, before, after = record.name, self._wills.get(record.name), record.will
         if after is not None:
             full = before is None and len(self._wills) >= self._max_wills
-            if full or not self._resize(_size(after)):
+            if full or not self._resize(_size(after)):  # for a moment it needs room beside the earlier one
                 self._refuse(f"will of {name}")
                 return False
             self._wills[name] = after

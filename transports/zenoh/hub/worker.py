@@ -123,9 +123,9 @@ class HubWorker:
         try:
             needs = wire.decode_counts(_payload(query))
         except (ValueError, msgspec.DecodeError):
-            query.drop()  # type: ignore[no-untyped-call]
+            query.drop()  # type: ignore[no-untyped-call]  # it ends without an answer
             raise
-        if not self._waiting.add(needs, query, time.monotonic()):
+        if not self._waiting.add(needs, query, time.monotonic()):  # it need not wait, or finds no room
             self._answer(query)
 
     def _answer(self, query: zenoh.Query) -> None:
@@ -139,7 +139,7 @@ class HubWorker:
         if "*" not in text:
             retained = self._store.get(text.removeprefix(wire.RETAINED))
             return [] if retained is None else [retained]
-        begin = text.partition("*")[0].rstrip("$/")  # a quick choice; no $ of "$*", and no /: "a/**" matches "a"
+        begin = text.partition("*")[0].rstrip("$/")  # of all matches: no $ of "$*"; no /, as "a/**" matches "a"
         keyed = ((wire.RETAINED + retained.key, retained) for retained in self._store.retained())
         return [retained for key, retained in keyed if key.startswith(begin) and wanted.intersects(key)]
 

@@ -127,12 +127,12 @@ def _rules(what: str, trial: BrokerTrial, peer: Peer, topic: str) -> CheckResult
     peer.subscribe(other)
     payload = new_probe(time.time_ns() // 1_000_000)
     mid = peer.publish(other, payload, qos=1)
-    is_back, _ = _echo(trial, peer, topic)  # sent later: if the first one was let through, it came before this
+    is_back, _ = _echo(trial, peer, topic)  # a later probe: once it is back, the earlier one came or never comes
     if payload in peer.payloads():
         fix = "start it with the files of `pebble fleet init FOLDER --host NAME`, see docs/ext/fleet.md"
         return failed("has no rules: with this account one can pose as any robot, and drive it", fix, what)
     code = peer.acks.get(mid, 0)
-    if code >= REFUSED and not reasons.concerns_login(code):  # as "not authorized" does, the answer of a rule
+    if code >= REFUSED and not reasons.concerns_login(code):  # rules answer "not authorized", a code of logins
         return warn(f"refuses a message to another robot, but not for that: {reasons.words(code)}", what=what)
     if not is_back and not peer.closed:
         return warn("does not answer in time: whether it has rules is not known", what=what)

@@ -122,8 +122,8 @@ def refusals(trial: BrokerTrial) -> CheckResult:
     writer.publish("x")
     if trial.wait(lambda: reader.received, 1.0):
         return skipped("this account is refused none")
-    may_publish = _is_forbidden(trial) is False  # not None: the broker has accepted a message there
-    if may_publish:
+    is_forbidden = _is_forbidden(trial)  # None: not known
+    if is_forbidden is False:  # the broker has accepted a message there
         return warn("it grants them, and then delivers nothing")
     return skipped("it grants them, and nothing comes: this account may not publish there, or may not read")
 
@@ -278,9 +278,9 @@ def last_will(trial: BrokerTrial) -> CheckResult:
     if seconds > _WILL_S + trial.round_trip_s:
         trial.late = True  # as above
         return warn(f"one is published {seconds:.1f} s after the connection is reset")
-    late = trial.peer()
-    late.subscribe("online", qos=trial.qos)
-    trial.wait(lambda: not retain or late.received)
-    if retain and late.payloads()[-1:] != [b"gone"]:
+    latecomer = trial.peer()
+    latecomer.subscribe("online", qos=trial.qos)
+    trial.wait(lambda: not retain or latecomer.received)
+    if retain and latecomer.payloads()[-1:] != [b"gone"]:
         return warn("one is published, and not retained", "allow retained wills")
     return ok(f"once, {seconds:.2f} s after a reset{', and retained' if retain else ''}")

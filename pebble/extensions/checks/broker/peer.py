@@ -227,7 +227,7 @@ class BrokerTrial:
         self.late = False
         result = test(self)
         if self.late and result.state in _BAD:
-            result = test(self)
+            result = test(self)  # `late` stays set: a good result of this second test is qualified as well
         if not self.late or result.state in _BAD:
             return result
         return replace(result, text=f"{result.text}; an answer was late, the broker or this machine is busy")
@@ -282,7 +282,7 @@ class BrokerTrial:
             lambda: condition() or all(peer.closed or len(peer.pongs) > before for peer, before in asked.items()),
             _MORE_PATIENCE * self.answer_s,
         )
-        came = self._serve(condition, _QUIET_S)  # after so much silence nothing more comes
+        came = self._serve(condition, _QUIET_S)  # it may come after the pongs, but not after so much silence
         self.late |= came
         return came
 

@@ -91,7 +91,8 @@ def assessment(states: Mapping[str, State]) -> list[str]:
         return [f"robots cannot use it with this account: {', '.join(broken)}"]
     limited = [name for name, state in states.items() if state is State.WARN]
     limits = f", with limits: {', '.join(limited)}" if limited else ""
-    seen = {State.OK: "too", State.WARN: "after their next state, or by name", State.SKIPPED: "not at all"}
-    at_rest = seen[states.get(_WILDCARDS, State.SKIPPED)]  # skipped if nothing is retained
+    # How operators see a robot that sends nothing new, by the probe of retained messages, skipped if there are none.
+    ways = {State.OK: "too", State.WARN: "after their next state, or by name", State.SKIPPED: "not at all"}
+    at_rest = ways[states.get(_WILDCARDS, State.SKIPPED)]
     mirror = "can" if states.get(_BRIDGE_MODE) is State.OK else "cannot"
     return [f"robots can use it{limits}", f"operators see robots at rest {at_rest}", f"a mirror {mirror} use it"]

@@ -7,7 +7,7 @@ from pebble.extensions.checks.broker import MOSQUITTO, OTHER
 from pebble.extensions.checks.broker.peer import BrokerTrial, Peer, RefusedError
 
 _STATES = 200  # retained ones; a robot has some twenty
-_TRIES = 6  # to get the retained message after a restart
+_TRIES = 6  # to get the retained message after a restart, each for a third of the time for an answer
 _MOST_FILTERS = 8  # filters in one SUBSCRIBE: AWS IoT closes the connection for more
 _PERSISTENT = f"{MOSQUITTO}persistence true, persistence_location /var/lib/mosquitto/, autosave_on_changes true"
 
@@ -71,8 +71,8 @@ def order(trial: BrokerTrial) -> CheckResult:
     trial.wait(lambda: all(b"%d" % newest in reader.payloads() for reader in readers))
     trial.wait_quiet(*readers)
     wrong = [reader for reader in readers if reader.payloads()[-1:] != [b"%d" % newest]]
-    # Readers in `live_last` got the newest message before an older live one, or not at all. The others in `wrong` got a
-    # message with the retain flag last: it was sent for the subscription, but later than newer live ones.
+    # Why the last message is wrong: with the retain flag it was sent for the subscription, but after newer live ones. A
+    # live one came after the newest, although it is older (`live_last`, which also has the readers that got nothing).
     live_last = [reader for reader in wrong if not reader.received or not reader.received[-1].retain]
     if live_last:
         return failed("the last value that comes to a new subscription is not the newest", OTHER)

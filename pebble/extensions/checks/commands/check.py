@@ -126,6 +126,7 @@ def _print(config: Config, path: Path, extension_facts: list[Facts]) -> None:
     print_grid("dim", facts(config, extension_facts), above=0)
     if config.robot.platform == "linux":
         output.print(Padding(_topics_table(config), (1, 0, 0, 2), expand=False))
+    # These may have names of folders, in which ``shown`` replaces control characters.
     print_grid("dim", [tuple(map(shown, row)) for added in extension_facts for row in added.table])
     print_grid("yellow", [("warning", warning) for warning in (*config.warnings, *_packages(config))])
 

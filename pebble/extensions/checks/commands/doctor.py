@@ -99,17 +99,17 @@ def doctor(
     return printer.end()
 
 
-#: Options, and those that they go with.
+#: By option: the modes that it goes with.
 _WITH = {"--may-move": ("--running",), "--root": ("--running", "--report")}
 
 
 def _check_modes(modes: dict[str, bool], options: dict[str, bool]) -> None:
-    """Raise BadParameter for options that do not go together."""
+    """Raise BadParameter for options that do not go together. Each is here by its name, with True if it is given."""
     chosen = [mode for mode, is_given in modes.items() if is_given]
     if len(chosen) > 1:
         raise typer.BadParameter(f"give {chosen[0]} or {chosen[1]}, not both")
     for option, is_given in options.items():
-        if is_given and not set(chosen) & set(_WITH[option]):
+        if is_given and not any(mode in _WITH[option] for mode in chosen):
             raise typer.BadParameter(f"{option} is for {' and '.join(_WITH[option])} only")
 
 

@@ -144,7 +144,7 @@ def sizes(robot: Observer) -> CheckResult:
 def retained(robot: Observer) -> CheckResult:
     """Check that the channels of states are published with the retain flag, and no others."""
     retained_metrics = {record.metric for record in robot.retained()}
-    lacking, stale = set(), set()
+    lacking, surplus = set(), set()
     for record in robot.records:
         channel, is_retained = record.channel, record.metric in retained_metrics
         if channel is None or not record.payload:
@@ -152,12 +152,12 @@ def retained(robot: Observer) -> CheckResult:
         if channel.default_retain and channel not in _REPEATED and not is_retained:
             lacking.add(record.metric)
         if is_retained and not channel.default_retain and channel is not c.MCU_VALUE:  # its manifest decides
-            stale.add(record.metric)
+            surplus.add(record.metric)
     if lacking:
         fix = "publish it with the retain flag: who connects later lacks it"
         return failed(f"not retained: {some_of(sorted(lacking))}", fix)
     fix = "publish it without the retain flag: it is news only once"
-    return _none_of(stale, fix, f"{len(retained_metrics)} states", "retained: ")
+    return _none_of(surplus, fix, f"{len(retained_metrics)} states", "retained: ")
 
 
 def stale_commands(robot: Observer) -> CheckResult:
@@ -298,15 +298,15 @@ def _confirmed(_robot: Observer, _name: str) -> CheckResult:
 
 def _after_long_ones(robot: Observer) -> CheckResult:
     """Check that a stop still reaches the robot after messages that are too long for small boards."""
-    stops_it = while_stopped(_confirmed)
-    if stops_it(robot).state is not State.OK:  # OK: it has read all that was sent before
+    try_stop = while_stopped(_confirmed)  # a check: a stop is confirmed, and ends by its reset
+    if try_stop(robot).state is not State.OK:  # OK: it has read all that was sent before
         return skipped("no stop reaches it without them, either")
     for _ in range(_BURSTS):
         for _ in range(_LONGS):
             robot.send(c.CONTROL, _LONG)
         robot.sent(ANSWER_S)
         robot.look(ANSWER_S)
-    if stops_it(robot).state is State.OK:
+    if try_stop(robot).state is State.OK:
         return ok("a stop reaches it after them")
     return failed(
         f"after {_BURSTS * _LONGS} messages of {len(_LONG)} bytes no stop reaches it, until it connects again",

@@ -117,7 +117,7 @@ def at_the_wheel(robot: Observer, by: str = BY, answer_s: float = ANSWER_S) -> I
     """
     driver = Driver(robot, by)
     try:
-        if robot.view.controlled:
+        if robot.view.controlled:  # it decides itself who drives it
             driver.asks(for_ms=10_000)
             robot.answers(lambda: driver.holds, answer_s)
         if driver.may_drive:
@@ -226,14 +226,14 @@ def _reset_waits(robot: Observer, driver: Driver) -> CheckResult:
     began, _ = driver.drive(2 * STEP_S)  # from before the reset on: a pause would count as a release
     reset(robot)
     driver.drive(DRIVES_S / 2)
-    if robot.view.controlled:  # it knows by the key whose zero it is
-        driver.send(key=_OTHER_KEY)  # a zero
+    if robot.view.controlled:  # this robot gives keys, so it knows whose zero it receives
+        driver.send(key=_OTHER_KEY)  # another client's zero
     driver.drive()
     why = "a stick that is held down moves it after a reset"
     outcome = _not_moved(robot, began, why, "wait for a zero of who has control, or for 0.5 s without commands")
     if outcome.state is State.OK:
-        driver.send()  # the zero that counts as a release: now it must move
-        outcome = _rest(robot, *driver.drive(), RESTS_S)
+        driver.send()  # the zero that counts as a release
+        outcome = _rest(robot, *driver.drive(), RESTS_S)  # now it must move, and rest afterwards
     is_free = robot.wait(lambda: not robot.view.latched, ANSWER_S)
     return outcome if is_free else failed("a reset does not end the stop", END_IT)
 

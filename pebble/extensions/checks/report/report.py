@@ -94,13 +94,13 @@ def _here(places: Places, file: Path) -> Here:
         return Here(places, file, None, str(error))
 
 
-def _index(report: Report, known: Secrets) -> str:
+def _index(report: Report, secrets: Secrets) -> str:
     lines = [f"Pebble {__version__}, {time.strftime('%Y-%m-%d %H:%M:%S %z')}", ""]
     lines += [f"{name}: {len(text):,} characters" for name, text in report.parts.items()]
     lines += [f"{name}: MISSING: {why}" for name, why in report.missing.items()]
-    lines += ["", f"{len(known.known)} passwords and keys of this machine are hidden in it"]
-    lines += [f"too short to be hidden: one in {where}" for where in known.short]
-    lines += [f"could not be read, so what is in it is not hidden: {file}" for file in known.unread]
+    lines += ["", f"{len(secrets.known)} passwords and keys of this machine are hidden in it"]
+    lines += [f"too short to be hidden: one in {where}" for where in secrets.short]
+    lines += [f"could not be read, so what is in it is not hidden: {file}" for file in secrets.unread]
     return "\n".join(lines) + "\n"
 
 

@@ -101,8 +101,9 @@ def _end(robot: RobotUnderTest, name: str, before: dict[str, list[str]]) -> str:
     if not view.latched:
         return ""
     for owner, state in view.estop.latched.items():
-        others, known = state.recent[1:], before.get(owner, [])
-        if state.recent[:1] != [name] or any(other not in known for other in others):  # there are other new stops
+        is_newest = state.recent[:1] == [name]  # of the owner's stops
+        new_others = [other for other in state.recent[1:] if other not in before.get(owner, [])]
+        if new_others or not is_newest:
             return f"it was stopped by another one meanwhile, and stays so ({state.by or 'unknown'}: {state.why})"
     reset = Reset(view.estop, robot.by)
     send(partial(robot.own_side.transport.publish, urgent=True), reset.messages())
@@ -118,7 +119,7 @@ def retained_commands(robot: RobotUnderTest) -> CheckResult:
     reset of another kind follows, which must be answered: this shows that the silence before was no accident.
     """
     operators = robot.commanding_side
-    if robot.own_side.heartbeats:  # the bridge sends them to the operators' broker alone: so both sides are there
+    if robot.own_side.heartbeats:  # the bridge sends them to operators alone: both sides are at the operators' broker
         return skipped("one broker serves both sides: there, what is published to be retained is live at first")
     owner, state = next(iter(robot.view.estop.states.items()), (None, None))
     if owner is None or state is None:
@@ -132,7 +133,7 @@ def retained_commands(robot: RobotUnderTest) -> CheckResult:
         states = [record for record in operators.of(ESTOP_STATE, began) if record.metric == metric]
         return {record.value.reset_refused for record in states if record.value is not None}
 
-    def publish_retained(payload: bytes) -> None:  # by ``beside``, a connection that is made below
+    def publish_retained(payload: bytes) -> None:  # on ``beside``, the connection that the with block below opens
         beside.publish(topic, payload, qos=QoS.DELIVERED, retain=True, remember=False)
         robot.wait(lambda: beside.outgoing.waiting == 0, robot.patience_s)
 
@@ -158,7 +159,8 @@ def wheels(robot: RobotUnderTest) -> CheckResult:
     """Drive a short way ahead and back, if a person has agreed; after each the robot must stop by itself."""
     if robot.view.charging:
         return skipped("it is on its charger")
-    with at_the_wheel(robot.commanding_side, robot.by.partition("@")[0], _CONTROL_S) as driver:
+    user = robot.by.partition("@")[0]  # without the machine: names of who has control hold no @
+    with at_the_wheel(robot.commanding_side, user, _CONTROL_S) as driver:
         if not driver.may_drive:
             return skipped(f"{robot.commanding_side.view.control.who or 'no one'} has control")
         ahead = _drive(robot, driver, _SPEED)

@@ -187,7 +187,7 @@ def remove(name: _Name, folder_: _Folder = None) -> int:
     with _locked_fleet(folder_) as (place, fleet):
         account = _account(place, fleet, name)
         after = fleet.without(name)
-        is_person = not set(account.roles) & set(ProgramRole)
+        is_person = not set(account.roles) & set(ProgramRole)  # it has no role of a program
         unfinished = list(_remove_from_pages(fleet, name)) if is_person else []
         unfinished += _copies(place, after)
         try:
@@ -281,7 +281,7 @@ def apply_(folder_: _Folder = None) -> int:
         unfinished = list[str]()
         if fleet.rules == "plugin":
             fleet, unfinished = plugin.convert(place, fleet)
-        if applying.obeys_plugin(place):
+        if applying.obeys_plugin(place):  # it reads no files before mosquitto.conf is changed
             unfinished += applying.conf_differences(place, fleet)
         else:
             typer.echo(f"{_shown(place)} knows {len(fleet.accounts)} accounts ({applying.apply(place, fleet)})")
@@ -297,8 +297,8 @@ def check_(folder_: _Folder = None) -> int:
     """
     require_packages("pebble fleet")
     with _locked_fleet(folder_) as (place, fleet):
-        others, rules = check.by_hand(place, fleet), check.of_rules(place, fleet)  # to mend by hand; by `apply`
-    code = _print_left(others + rules)
+        by_hand, rules = check.by_hand(place, fleet), check.of_rules(place, fleet)  # `apply` mends only the rules
+    code = _print_left(by_hand + rules)
     if rules:
         typer.echo(f"pebble: `pebble fleet apply --folder {_shown(place)}` writes the rules again", err=True)
     if not code:

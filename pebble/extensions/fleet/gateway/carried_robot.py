@@ -92,7 +92,7 @@ class Beginning:
 def begin(robots: Sequence["CarriedRobot"], hub: Transport, broker: Transport) -> None:
     """Start forwarding for ``robots``, beginning with the hub's retained messages.
 
-    These wait until the forwarders are open. What comes from the broker would be dropped before that: so subscribing
+    Retained messages wait until their forwarder is open, but commands from the broker would be dropped: so subscribing
     there is the last step. All robots share the wait for a side, as a round trip takes longer than all else.
     """
     _subscribe(robots, Side.LOCAL, hub, f"{OUTGOING}/#", f"{INCOMING}/flags/#")
@@ -106,11 +106,11 @@ def _subscribe(robots: Sequence["CarriedRobot"], side: Side, transport: Transpor
     handlers: dict[str, Handler] = {}
     for robot in robots:
         handlers |= robot.subscribing(side, *below)
-    subscriptions = iter(transport.subscribe_all(handlers, echo=False, direct=True))
+    subscriptions = iter(transport.subscribe_all(handlers, echo=False, direct=True))  # in the order of ``handlers``
     if side is Side.REMOTE:  # some brokers send retained messages only for exact names
         transport.ask([flag for robot in robots for flag in robot.subjects.flags])
     for robot in robots:
-        robot.subscribed(side, islice(subscriptions, len(below)))  # the next ones, as in ``handlers``
+        robot.subscribed(side, islice(subscriptions, len(below)))  # takes those of this robot
 
 
 class CarriedRobot:
@@ -175,6 +175,7 @@ class CarriedRobot:
                 self.forwarder.retained.synchronize(side)
         if now >= self._probe_at:
             self._probe_at = now + PROBE_PERIOD_S
+            # REMOTE: only from there commands pass (see GATEWAY).
             self.forwarder.publisher.probe_again((Side.REMOTE,), self.forwarder.retained.value)
 
     # -- the transports' threads

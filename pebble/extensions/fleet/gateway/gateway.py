@@ -118,7 +118,7 @@ class Gateway:
             transport.policy.is_stop = is_stop
             transport.on_state(self._on_state)
         self._presence.on_state(self._on_presence)
-        # For these rules see TopicPolicy. A robot's forwarder decides which of two values of a topic counts.
+        # For these rules see TopicPolicy. `delivers_late`: a robot's forwarder decides which of two values counts.
         self._hub.policy.is_invented = self._is_invented
         self._broker.policy.skips_retained, self._broker.policy.delivers_late = self._skips_retained, True
         for transport in (self._hub, self._stops, self._presence, self._broker):

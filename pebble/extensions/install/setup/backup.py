@@ -264,6 +264,6 @@ def _content(tar: tarfile.TarFile, member: tarfile.TarInfo) -> bytes:
     opened = tar.extractfile(member)
     content = b"" if opened is None else opened.read()
     digest = hashlib.sha256(content).hexdigest()
-    if len(content) != member.size or member.pax_headers.get(_SHA256, digest) != digest:  # the first file has none
+    if len(content) != member.size or member.pax_headers.get(_SHA256, digest) != digest:  # ABOUT, the first, has none
         raise EOFError(f"{member.name} is not what it was")
     return content

@@ -149,8 +149,8 @@ class Job:
         if typed is not None and self.answers.broker != HERE:
             yield self._file("password of the robot at its broker", file, f"{typed}\n".encode())
         if self.answers.broker == HERE:
-            # The robot's password stays if it is of an unfinished setup (there is no config), or of this same broker.
-            # The page's stays, as it was never of another one.
+            # The robot's password stays if an unfinished setup has made it (there is no config), or if the robot used
+            # this same broker before. The page's stays in any case: it was never for another broker.
             keeps_password = self.config is None or self.has_login
             yield self._new_password("password of the robot at its own broker", file, known=keeps_password)
             if self.answers.page:
@@ -215,17 +215,19 @@ class Job:
         yield self._file("authority of the broker", self.places.etc / BROKER_CA, content)
 
     def _certificate(self) -> Iterator[Step]:
+        """Yield the step that makes a certificate for the page, and an authority that signs it."""
         tls = self.places.tls
         if self.page is not None and self.page.section(WebInterface).tls.certificate != tls / certificates.SERVER_CERT:
-            return  # it has another one
+            return  # the page has another certificate
 
         def fill(new: Path) -> None:
             certificates.init(new, certificates.own_names())
-            (new / certificates.SERVER_KEY).chmod(0o640)  # the robot reads it; only root signs others
+            (new / certificates.SERVER_KEY).chmod(0o640)  # the robot reads it; only root reads the authority's
 
         yield Step("certificate of the page", tls.is_dir, lambda: self.system.make_folder(tls, 0o750, ROBOTS, fill))
 
     def _first_user(self) -> Iterator[Step]:
+        """Yield the step that adds the answered user of the page, if one is needed."""
         file, name = self.people, self.answers.user
         if not self.needs_user:
             return

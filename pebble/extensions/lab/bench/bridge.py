@@ -84,7 +84,7 @@ def measure(settings: Settings, number: int, progress: Progress) -> Iterator[Cel
     """Yield the results of fresh robots with and without reports of their MCUs, each measured in turns of a second."""
     passes = max(1, round(settings.seconds))
     for load in in_turn((REPORTS, COMMANDS), number):
-        variants = [name for name in settings.variants if name != FLOOR or load == COMMANDS]  # FLOOR has none
+        variants = [name for name in settings.variants if name != FLOOR or load == COMMANDS]  # FLOOR: no reports
         turns: dict[str, list[Turn]] = {variant: [] for variant in variants}
         progress("starting the robots")
         with running(variants, reports=load == REPORTS) as driven:
@@ -110,7 +110,8 @@ def cells_of(variant: str, load: str, turn: Turn, arrived: Arrived) -> Iterator[
         reports = [report for report in arrived.reports if turn.began <= report.sent_ns <= turn.ended]
         up = [(report.received_ns - report.sent_ns) / 1e6 for report in reports if report.received_ns is not None]
         yield round_cell(variant, UP, "ms", up, params, sent=len(reports))
-    # CPU time goes to all reports that arrive in the turn, also to those whose latency is unknown: see Arrived.
+    # CPU time is shared by all reports that arrive in the turn. `reports` above has only those whose latency is known:
+    # their values were sent once.
     received = [ns for ns, _ in arrived.received if turn.began <= ns <= turn.ended]
     forwarded = len(down) + len(received)
     for process, cpu_s in turn.cpu_s.items():

@@ -127,7 +127,7 @@ class DrivenRobot(StockClient):
         for _ in paced(seconds):
             self._number += 1
             speeds = wheels(self._number)
-            sent[speeds] = round(1e9 * self._driver.command(drive_of(*speeds)))  # it returns when it has sent, in s
+            sent[speeds] = round(1e9 * self._driver.command(drive_of(*speeds)))  # the time of sending
         ended = time.monotonic_ns()
         used = {part: cpu_s([pid]) - before[part] for part, pid in self._pids.items()}
         if min(used.values()) <= 0:  # the CPU time of a process that has ended is 0

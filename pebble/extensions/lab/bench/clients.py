@@ -112,7 +112,7 @@ def driving(port: int, *bases: str) -> Iterator[None]:
     ended = threading.Event()
     with closing(StockClient().open(port)) as client:
         drivers = [client.driver(base, ended.wait) for base in bases]
-        threads = [threading.Thread(target=driver.drive, args=(0.0, _THROTTLE), daemon=True) for driver in drivers]
+        threads = [threading.Thread(target=driver.drive, kwargs={"z": _THROTTLE}, daemon=True) for driver in drivers]
         for driver, thread in zip(drivers, threads, strict=True):
             driver.command(Drive())  # begins at rest, as a person does
             thread.start()

@@ -119,7 +119,7 @@ def measure(variant: str, condition: Params, seconds: float) -> Cell:
         for reader in readers:
             reader.answer(_READY_S)
         time.sleep(_STARTUP_S)
-        measured = [writer, *readers] if broker is None else [writer, *readers, broker]
+        measured = [writer, *readers] if broker is None else [writer, *readers, broker]  # the order of all CPU times
         before, began_ns = [cpu_s([program.pid]) for program in measured], time.monotonic_ns()
         time.sleep(seconds)
         window = range(began_ns, time.monotonic_ns())

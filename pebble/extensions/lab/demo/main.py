@@ -70,7 +70,7 @@ def run(seconds: float | None = None, *, embedded: bool = False, for_phones: boo
 
 
 class Demo:
-    """The robots, their operator page, and the programs that drive and watch the robots."""
+    """The robots, their operator page, and the programs that drive and watch them: :meth:`start`, then :meth:`play`."""
 
     def __init__(self, testbed: Testbed, console: Console, ending: threading.Event, seconds: float | None) -> None:
         self._testbed, self._console, self._ending, self._seconds = testbed, console, ending, seconds
@@ -89,7 +89,7 @@ class Demo:
         testbed.start_robots()
         if phone is None and self._seconds is None:  # a page for phones asks for a login; a timed demo has no visitors
             threading.Thread(target=self._prepare_recordings, name="pebble-demo-index", daemon=True).start()
-        self._operator = Operator(testbed.broker_port)
+        self._operator = Operator(testbed.broker_port)  # it drives, in `play`
         self._operator.connect()
 
     def play(self) -> list[str]:
@@ -103,7 +103,7 @@ class Demo:
             problems = self._testbed.unexpected_exits()
         finally:
             self._operator.close()
-        if missing and not self._ending.is_set():  # otherwise they were not waited for
+        if missing and not self._ending.is_set():  # at an early end the robots were not waited for
             return problems + [f"{name} did not become ready to drive within {_DISCOVERY_S:.0f} s" for name in missing]
         wrong_by_robot = ((robot, self._wrong(robot)) for robot in robots)
         return problems + [f"{robot.name}: {'; '.join(wrong)}" for robot, wrong in wrong_by_robot if wrong]

@@ -279,11 +279,11 @@ class Operator:
         lights = codec.encode(channel, step.lights)
         for robot in self._robots:
             self._publish(robot.topic(channel), lights)
-        released = self._hold(step.drive, step.drive_s)
+        released_at = self._hold(step.drive, step.drive_s)
         if step.sends_stop:
-            released = self._drive(STOP)  # a zero: from now on they must rest
+            released_at = self._drive(STOP)  # a zero, sent now: from then on they must rest
         self._wait(step.rest_s)
-        self._complete(step.name, step.drive, began, released, time.monotonic())
+        self._complete(step.name, step.drive, began, released_at, time.monotonic())
 
     def _stop_all(self, robots: Sequence[RobotView]) -> None:
         """Drive all, stop them, try to drive, reset, drive again. A person's stop is left to the person."""

@@ -121,13 +121,13 @@ def _play(sound: _Sound, recorder: _Recorder) -> bool:
     due, frames, stopped = 0.0, 0, False
     try:
         for chunk in sound.chunks():
-            if not frames:
+            if not frames:  # the first chunk
                 recorder.begin()
                 due = time.monotonic()
             recorder.add(chunk)
             count = len(chunk) // (sound.channels * sound.width)
             frames += count
-            due = max(due, time.monotonic() - _DELAY_LIMIT_S) + count / sound.rate
+            due = max(due, time.monotonic() - _DELAY_LIMIT_S) + count / sound.rate  # what is later than that stays late
             time.sleep(max(0.0, due - time.monotonic()))
     except _StoppedError:
         stopped = True

@@ -86,7 +86,7 @@ class FrameWriter:
         self._retry_at = _NEVER
         if self.problem:
             log.warning("%s", self.problem)
-            if not self._has_room():
+            if not self._has_room():  # which may change: see may_share
                 self._retry_at = time.monotonic() + RETRY_S
         small = self._declare_publisher(session, _DROP)  # for sound, and for references to shared memory
         # For pictures that are sent as bytes; a writer of sound has none.
@@ -236,6 +236,7 @@ class FrameWriter:
         return chunk
 
     def _put(self, payload: Any, info: FrameInfo, *, shared: bool = False) -> bool:
+        """Send a frame; False if this is closed. ``shared``: it is in shared memory, and ``payload`` refers to it."""
         publishers = self._publishers
         if publishers is None:
             return False
@@ -252,7 +253,7 @@ class FrameWriter:
         self.counters.add("written")
         if shared:
             self.counters.add("shared")
-        elif self._pool is not None:
+        elif self._pool is not None:  # which had no room
             self.counters.add("fallbacks")
         return True
 

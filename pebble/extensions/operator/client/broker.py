@@ -77,8 +77,8 @@ class Broker:
         self.transport.on_state(lambda _state: self._call(self._notify))
         self._loop: asyncio.AbstractEventLoop | None = None
         self._watchers: list[Callable[[], None]] = []
-        self._arrived = Arrived()
-        self._woken = False  # deliver is about to be called
+        self._arrived = Arrived()  # messages that wait for :meth:`deliver`
+        self._woken = False  # the event loop was told to call :meth:`deliver`
         self._printing: PrintingThread | None = None
         #: True for the base topic of a robot that takes commands only with a name.
         self.is_named: Callable[[str], bool] = lambda _base: False

@@ -93,7 +93,8 @@ class ControlClient:
         self.passed_over = ""  # the id of a client whose request was declined here
         self._by, self._device, self._pace_of = by, device, pace_of
         self._take = False  # the next request takes control from its holder
-        self._asked_at = self._answered_at = self._due_at = 0.0  # due: the next request
+        # When this client began to ask, when the robot last showed that it deals with requests, when the next is due.
+        self._asked_at = self._answered_at = self._due_at = 0.0
         self._out: list[Message] = []
 
     # -- what is wanted
@@ -134,7 +135,7 @@ class ControlClient:
         if self.held:  # free: control has ended, or the motor owner was started again: request it anew, at once
             self._asked_at = self._answered_at = self._due_at = now
         self.held, self.decided = False, ""
-        if state.asks_id:  # the robot answers: it asks the holder, for this client or for one before it
+        if state.asks_id:  # the robot deals with requests: it asks the holder for this client, or for an earlier one
             self._answered_at = now
         has_another_owner = any(owner.id == self.id for owner in self.robot.states)
         if state.id and has_another_owner:  # another client has the deciding owner: first let it get all of them
@@ -197,6 +198,7 @@ class ControlClient:
         for_ms: float = WIDE.control_for_ms,
         t: int | UnsetType = UNSET,
     ) -> Message:
+        """Return a request on CONTROL or CONTROL_TAKE; ``t``: the time stamp, where the link's pace wants one."""
         request = ControlRequest(id=self.id, want=want, for_ms=for_ms, by=self._by, device=self._device, t=t)
         return Message(channel.topic(self.robot.base), codec.encode(channel, request), QoS(channel.default_qos))
 

@@ -82,7 +82,7 @@ class RobotStop:
         """Return how far the robot's stop has got; SPARED only if the stop is for all robots, not for named ones."""
         if self.confirmed_s is not None:
             return Progress.CONFIRMED
-        # SPARED: by its capabilities it has no motors, neither that a stop holds nor that it drives.
+        # SPARED: in a stop of all robots (not ``named``) one that, by its capabilities, neither obeys stops nor drives.
         if self.estop.has_capabilities and not (self.estop.available or self.estop.drives or self._order.named):
             return Progress.SPARED
         if self.estop.old:
@@ -109,7 +109,10 @@ class RobotStop:
 
     @property
     def why(self) -> str:
-        """Return why the stop is not confirmed, in words; empty if it is. The owners' names come from the robot."""
+        """Return why the stop is not confirmed, in words; empty if it is. The owners' names come from the robot.
+
+        For ``old``, ``available``, ``drives`` and ``zeros`` see RobotEstop. A robot may have both owners and zeros.
+        """
         if self.progress in (Progress.CONFIRMED, Progress.SPARED):
             return ""
         if self.estop.old:
@@ -162,7 +165,7 @@ class RobotStop:
             if can_hold_all and not self.unconfirmed:
                 self.confirmed_s = now - self._began
         elif self.unconfirmed and (self._order.hold or not self._settled):
-            # an owner has restarted, and had not saved the stop: it is sent again
+            # an owner has restarted, and the stop is held or was not saved: it is sent again
             self.confirmed_s, self._settled = None, False
             if self._order.hold:  # it may be hours old: count how long this confirmation takes
                 self._began = now

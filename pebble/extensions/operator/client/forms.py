@@ -141,6 +141,7 @@ def _bool(key: str, raw: Any) -> bool:
 
 
 def _numeric(setting: Setting, raw: Any) -> int | float:
+    """Return a number, or a text that is one, in the setting's type: int or float. Raises SettingError."""
     is_integer = setting.type == "int"
     error = SettingError(f"{setting.key} must be a {'whole ' if is_integer else ''}number")
     if isinstance(raw, bool) or not isinstance(raw, int | float | str):

@@ -54,10 +54,10 @@ class MediaReceiver:
             time.sleep(_STEP_S)
 
     def poll(self) -> None:
-        """Repeat unanswered requests, and request a missing key frame. Call it a few times a second."""
+        """Repeat requests while no payloads come, and request a missing key frame. Call it a few times a second."""
         now = time.monotonic()
         for request in list(self.requests.values()):
-            if request.settled:  # until then :meth:`request` ticks it
+            if request.settled:  # else :meth:`request` still begins it
                 send(self._transport, request.tick(now))
         if self._video.wants_keyframe and "video" in self.requests:
             send(self._transport, self.requests["video"].keyframe(self.encoding.get("video"), now))

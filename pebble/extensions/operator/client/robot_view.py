@@ -40,7 +40,7 @@ class Liveness:
         self._returns: deque[float] = deque(maxlen=2)  # when a heartbeat came after people had been told of a silence
 
     def heartbeat(self, now: float, latency_s: float, *, online: bool = True, t: int = 1) -> None:
-        """Note a heartbeat with the time ``t``, in milliseconds of the component's clock (1: not on a whole second)."""
+        """Note a heartbeat; ``t``: its time in ms of the component's clock, for `whole_seconds` alone (1: none)."""
         self._stamps.append(t)
         interval_s = None if self.received_at is None else now - self.received_at
         # shorter than any config allows: both heartbeats waited in a queue; longer: a pause, which is no interval
@@ -331,7 +331,8 @@ class RobotView:
             online=self.online(now),
             latched=self.latched,
             free_s=now - self.reset_at,
-            published=bool(self.capabilities) or self.estop.has_capabilities,  # also assumed; its own even if empty
+            # Capabilities that are assumed for it count, and its own even if they are empty.
+            published=bool(self.capabilities) or self.estop.has_capabilities,
             drives=self.drives,
             arbitrates=self.arbitrates,
             script=bool(self.script),

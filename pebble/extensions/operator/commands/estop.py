@@ -150,7 +150,8 @@ def _viewed(transport: Transport, receiving: Transport, names: Names) -> RobotVi
         return base == robot.base and robot.named
 
     put_account_into_topics(transport, names, is_named)
-    # LINK is for ``view.pace``, STATUS for ``view.driveable``: the longer one, on the connection without answers
+    # LINK is for ``view.pace``, STATUS for ``view.driveable``. STATUS is the longer one: it must not delay the answers
+    # to the reset, which come on ``receiving``.
     for channel, connection in ((LINK, receiving), (STATUS, transport)):
         take = partial(view.receive, channel, now=0.0, wall=0.0)  # neither depends on the time
         connection.subscribe(channel.topic(robot.base), take, direct=True)

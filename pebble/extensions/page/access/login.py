@@ -46,7 +46,7 @@ class _Hashing:
     async def check(self, request: Request, login: Login) -> User | None:
         """Check name and password. Raises TooManyTriesError, also while too many logins wait."""
         if self._waiting >= _WAITING:
-            raise TooManyTriesError(5)
+            raise TooManyTriesError(5)  # seconds until the next try
         self._waiting += 1
         try:
             check = request.app.state.people.check

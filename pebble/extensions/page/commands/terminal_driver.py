@@ -187,10 +187,10 @@ class TerminalDriver:
         view, situation = self._driven.shown(self._tab, now), self.robot.situation(now)
         situation = situation._replace(
             driven=view.by != "" and not view.you,
-            listening=not view.you,  # "Take control to drive": a terminal needs control even if no person has it
+            listening=not view.you,  # "Take control to drive": here control is needed even if no person has it
             stopping=self.stop is not None and not self.stop.finished,
         )
-        if not self._heartbeat:
+        if not self._heartbeat:  # none comes on this connection: a robot counts as online
             situation = situation._replace(online=True)
         device = f"{view.device}, " if view.device else ""
         driver = f"{view.by} ({device}name {'' if view.checked else 'not '}checked)"

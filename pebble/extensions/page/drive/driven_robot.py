@@ -352,9 +352,9 @@ class DrivenRobot:
     def _has_ended(self, wish: Wish, now: float) -> bool:
         """True if the page wants no control any more, and the robot confirms that or has not answered in time."""
         if not wish.client.done:
-            wish.ended_at = float("inf")  # it may have asked again
+            wish.ended_at = float("inf")  # not ended: it may have asked again, or its release is not sent yet
             return False
-        wish.ended_at = min(wish.ended_at, now)
+        wish.ended_at = min(wish.ended_at, now)  # the first time that this was seen
         state = self.published
         return state is None or state.id != wish.client.id or now - wish.ended_at > self.pace.answer_s
 
@@ -389,9 +389,9 @@ class DrivenRobot:
     def _zero(self, tab: Tab, op: DriveOp, now: float) -> list[Command]:
         """Return a zero to publish, which is sent in every state. It ends this gesture and the page's earlier ones."""
         tab.end_until(op.g)
-        if tab.moves is self and op.g >= tab.gesture:  # it moves by one of these gestures
+        if tab.moves is self and op.g >= tab.gesture:  # the page moves this robot by one of these gestures
             self._on(Event.LETS_GO, now)
-        commands = tab.interrupt(op.g, now)  # zeros of another robot, if the page moves that by this gesture
+        commands = tab.interrupt(op.g, now)  # zeros of another robot, if the page moves one by one of these
         if self._is_assumed:  # a silent board that connects anew is stopped only by a zero after that
             self._repeat_zeros(now)
         # Unless it is ``final`` (see DriveOp), the driver has let go: an interrupted script may resume.

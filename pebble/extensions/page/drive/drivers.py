@@ -88,11 +88,11 @@ class Drivers:
         now = clock()
         old_tabs = {robot.tab for robot in self._driven.values() if robot.tab is not None and robot.tab.token == token}
         for old in old_tabs:
-            if old.clock.problem(now):
+            if old.clock.problem(now):  # its connection stalls, or is too slow
                 self.closed(old)
         for robot in list(self._driven.values()):
             if robot.awaits(token, now) and (view := self._robots.view(robot.ref)) is not None:
-                self.take(tab, view, lambda: None, lambda _why: None, over=False)
+                self.take(tab, view, lambda: None, lambda _why: None, over=False)  # no request, so it gets no answer
 
     def closed(self, tab: Tab, *, for_good: bool = False) -> None:
         """Note that a page's connection has ended; ``for_good``: its user may no longer drive."""

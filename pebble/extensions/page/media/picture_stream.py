@@ -153,12 +153,12 @@ class PictureStream(MediaStream[PageViewer, PictureView]):
         wanted = assess(queues, self._arrivals.encoding, now, can_rescue=can_rescue)
         if can_rescue and any(queue.rescued for queue in queues):
             self._rescue.start(self._chain)
-            wanted = wanted or not self._chain  # no pictures to begin with: it begins at the next key frame
+            wanted = wanted or not self._chain  # without pictures to convert, it begins with the next key frame
         else:
             self._rescue.stop()
         if wanted and not changing:
             for queue in queues:
-                queue.unserved = False
+                queue.unserved = False  # this key frame is for it
             await self._request.request_keyframe(self._arrivals.encoding)
 
     # -- what pages are shown

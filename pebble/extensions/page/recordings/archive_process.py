@@ -91,7 +91,7 @@ class Job:
             self._process.start()
         except OSError as error:
             self.why = f"no process could be started: {error.strerror or error}"
-        job_end.close()  # here: answers then ends with the process
+        job_end.close()  # in this process; so ``answers`` ends when the job's process does
         self._task = asyncio.create_task(self._follow(answers))
 
     @property

@@ -137,7 +137,8 @@ class PlayedRobot:
         self.sent = self.skipped = 0  # an output has them; nothing is counted here
         self.moves = False  # a shown recording moves nothing
         self._newest_ns = at_ns  # of what was sent
-        # _begin sets what starts again with each seek. The source calls it, the first time before any message.
+        # _begin sets what starts again with each seek, such as _picture, the newest at that time, and _pictured_at, the
+        # time of the last one that was shown. The source calls it, the first time before any message.
         self.player = Player(
             RobotSource(archive, ref, self._begin),
             lambda _channel: True,  # play all channels
@@ -204,7 +205,7 @@ class PlayedRobot:
         self._is_new = True  # nothing was sent since the seek
         self._rested = False  # the page was told that the player rests
         self._robot = RobotView(self._ref)
-        self._flushed_at = self._played_at = self._liveness_at = self._pictured_at = float("-inf")
+        self._flushed_at = self._played_at = self._liveness_at = self._pictured_at = float("-inf")  # sent last
         player = self.player
         self._link.write(m.Played(at=at_ns / 1e6, on=not player.paused, speed=player.speed, begins=True))
 
@@ -222,7 +223,7 @@ class PlayedRobot:
             return
         self._flushed_at = now
         position_ms = self.player.position_ns / 1e6
-        rests = self.player.paused and not self._is_new  # after a seek even a paused player has something to show
+        rests = self.player.paused and not self._is_new  # _is_new: after a seek even a paused player has to show it
         is_position_due = not rests and now - self._played_at >= _PLAYED_S
         knows_state = rests == self._rested  # the page was told whether the player rests now
         if is_position_due or not knows_state:
@@ -233,6 +234,7 @@ class PlayedRobot:
             self._values["web/liveness"] = liveness_of(self._robot, position_ms / 1e3), position_ms
         if self._values or self._is_new:
             self._is_new = False
+            # The last member of each is the age of the value.
             values = ((self._ref, metric, raw, position_ms - at_ms) for metric, (raw, at_ms) in self._values.items())
             self._link.write(m.State(now=position_ms, set=tuple(values)))
             self._values = {}

@@ -79,6 +79,7 @@ def record(
 
 
 def _run(recorder: Recorder, source: Source, where: str, length: str | None) -> None:
+    """Record for ``length``, such as ``10min``; None: until a signal."""
     logging.getLogger("pebble.extensions.recordings").setLevel(logging.INFO)
     ends_at = None if length is None else time.monotonic() + seconds(length)
     with ExitStack() as stack:

@@ -68,7 +68,7 @@ def write_film(
                 if sound.result.packets:
                     tracks.append(_sound_packets(av, wav, out, codec))
                 for packet in heapq.merge(*tracks, key=lambda packet: packet.dts * packet.time_base):
-                    if pictures.count:  # if there are any pictures: merge has asked each track for its first packet
+                    if pictures.count:  # 0: there are none, as merge asks each track for its first packet at once
                         out.mux(packet)
         except av.error.FFmpegError as error:
             raise RecordingError(f"{target}: {error}") from None

@@ -55,6 +55,7 @@ class _Export:
         self._channels: dict[str, Channel] = {}  # of converted messages, by topic
 
     def add(self, message: Recorded) -> None:
+        """Add a message in Foxglove's form, or as JSON. Media have no JSON: without a form they are left out."""
         topic, payload = message.channel.topic, message.payload
         if is_picture(payload) or payload.startswith(PBAT):
             converted = self._media.convert(topic, payload)

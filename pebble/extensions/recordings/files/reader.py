@@ -83,7 +83,8 @@ class RecordingFile:
         self.statistics: Statistics | None = None  # None: the file is not finished, or its summary is incomplete
         self._schemas: dict[int, Schema] = {}
         self._metadata: list[int] = []  # positions of the records of metadata
-        self._scan = Scan(self._read, self.damage)
+        self._scan = Scan(self._read, self.damage)  # of all records, for a file without a usable summary
+        #: Returns a chunk's messages of all channels; the newest few chunks stay in memory.
         self._recent = lru_cache(_KEPT)(partial(self._unpacked, chooses=lambda _channel: True))
         try:
             self._file = open_plain(path)
@@ -230,6 +231,7 @@ class RecordingFile:
 
     def _take_over(self, summary: Summary) -> bool:
         """Use the summary; False if it does not cover all messages, as in files of other programs."""
+        # A chunk without an index of messages is left out: it has none, or the count below is not the file's.
         chunks = [_chunk_of(index) for index in summary.chunk_indexes if index.message_index_offsets]
         counted = summary.statistics
         if counted is None or counted.message_count != sum(chunk.messages for chunk in chunks):

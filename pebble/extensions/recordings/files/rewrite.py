@@ -121,7 +121,8 @@ def _copy(source: Path, part: Path, keeps: Keeps, *, complete: bool) -> Rewritte
         writer.finish()
         sync_file(out.fileno())
     # Behind the last record a kill leaves nothing, zeros or part of a record. Other bytes there could not be read.
-    is_whole = not (damage.parts or damage.missing or damage.unnamed) and ends_as_after_kill
+    lacks_something = damage.parts or damage.missing or damage.unnamed
+    is_whole = ends_as_after_kill and not lacks_something
     return Rewritten(writer.messages, left_out, missing, damage.report(), is_whole)
 
 

@@ -74,12 +74,15 @@ class Scan:
         self._damage.torn = 0 if self._ended else max(0, size - self._at)
 
     def _with_indexes(self, chunk: Found) -> Found:
-        """Read the indexes behind a chunk; return it with its number of messages, and its channels if all are whole."""
+        """Read the indexes behind a chunk; return it with its number of messages, and its channels if all are whole.
+
+        Without channels these are looked for in the chunk.
+        """
         counts: dict[int, int] = {}
         while (record := self._record_at(self._at)) is not None and record.op == Op.MESSAGE_INDEX:
             channel, length = _INDEX.unpack(self._read(self._at + HEAD.size, _INDEX.size))
             counts[channel], self._at = length // INDEX_ENTRY, record.end
-        are_complete = record is not None or self._at >= self._size  # else channels are looked for in the chunk
+        are_complete = record is not None or self._at >= self._size  # something else follows, or the file ends here
         return chunk._replace(channels=frozenset(counts if are_complete else ()), messages=sum(counts.values()))
 
     def _record_at(self, at: int) -> Found | None:

@@ -85,11 +85,11 @@ class RecordingWriter:
         declared before their chunk, and all channels again once a minute.
         """
         self._named += self._new
-        named, self._new = self._new, []
+        due, self._new = self._new, []
         if self._log_ns >= self._names_again_ns:
-            named, self._names_again_ns = self._named, self._log_ns + _NAMES_AGAIN_NS
-        if named and self.messages:  # not before the first message: its time makes all channels due again
-            self._output.write(_packed(named))
+            due, self._names_again_ns = self._named, self._log_ns + _NAMES_AGAIN_NS
+        if due and self.messages:  # else none yet: by the time of the first message all channels will be due
+            self._output.write(_packed(due))
         self._writer.flush()
         self.indexed += len(self._used)
         self._used.clear()

@@ -58,7 +58,7 @@ class OpenFile:
 
     def add(self, item: Item, at_ns: int) -> None:
         """Add a message. Times never go back within a file. Raises OSError."""
-        if item.retained != CARRIED:  # each new file is given the retained values anyway
+        if item.retained != CARRIED:  # carried: each new file is given the retained values anyway
             self.pending.append(item)
         self.last_ns = log_ns = max(self.last_ns, at_ns)
         stamp = stamp_ns(item.payload)

@@ -122,7 +122,7 @@ class Source:
         """Record a message; an old one only where no second connection fetches those."""
         if message.topic.startswith(self._ignored):
             return
-        # A retain flag marks an old value; not with as_published, but then the broker sends none, see _make.
+        # The retain flag marks an old value. Not so with as_published, but then the broker sends no old ones (_make).
         is_live = self._transport.as_published or not message.retain
         if is_live:
             self._recorder.receive(

@@ -253,7 +253,7 @@ class Player:
         elif due_s > _NOW_S:
             self._pass(min(due_s, _TICK_S))
             return
-        if due_s < -_LATE_S:  # too late to catch up; never after a long pause, as due_s is positive then
+        if due_s < -_LATE_S:  # too late to catch up: go on from here, too (a message after a long pause is never late)
             self._pace.go_on_from(message.log_ns)
         if self._send(message, message.log_ns):  # else it is tried again
             self._reading.advance()

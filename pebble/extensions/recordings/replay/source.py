@@ -57,5 +57,6 @@ def _is_state(message: Recorded) -> bool:
     if not message.payload or not suffix.startswith(f"{OUTGOING}/") or suffix in _HEARTBEATS:
         return False
     declared = channel_of(suffix)
-    retains = "1" in (message.channel.metadata.get("retain"), message.channel.metadata.get("retained"))
+    metadata = message.channel.metadata
+    retains = "1" in (metadata.get("retain"), metadata.get("retained"))  # published so; or an old one, thus retained
     return retains or (declared is not None and declared.kind is Kind.STATE)

@@ -122,8 +122,9 @@ def write_index(recording: Path, index: Path, scratch: Path, advance: Advance = 
         missing, unread = rows.read(recording, advance)
         facts = About(recording.name, state.st_size, state.st_mtime_ns, missing, unread)
         pairs = ", ".join(f"{name}: {quoted(getattr(facts, name))}" for name in About.__struct_fields__)
+        about = "{" + pairs + "}"  # as DuckDB writes a struct
         try:
-            connection.execute(_COPY.format(path=quoted(part), about=f"{{{pairs}}}"))
+            connection.execute(_COPY.format(path=quoted(part), about=about))
             part.replace(index)
         finally:
             part.unlink(missing_ok=True)

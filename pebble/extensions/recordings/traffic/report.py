@@ -140,10 +140,10 @@ def _figure(figure: Figure, robot: RobotTraffic) -> str:
 
 
 def _table(table: Table) -> str:
-    heads = "".join(f"<th{_class(number)}>{escape(title)}</th>" for number, (_, title) in enumerate(table.columns))
+    heads = "".join(f"<th{_class(column)}>{escape(title)}</th>" for column, (_, title) in enumerate(table.columns))
     rows = []
     for row in table.rows:
-        cells = "".join(f"<td{_class(number)}>{_formatted(value)}</td>" for number, value in enumerate(row))
+        cells = "".join(f"<td{_class(column)}>{_formatted(value)}</td>" for column, value in enumerate(row))
         rows.append(f"<tr>{cells}</tr>")
     return (
         f'<h2>{escape(table.title)}</h2><div class="scroll"><table><thead><tr>{heads}</tr></thead>'

@@ -97,7 +97,7 @@ def start(
 
         wait_for(is_answered, scripts.answer_s)
         status = scripts.status
-        if scripts.answers == answers_before or status is None:  # none came; one about another matter: see below
+        if scripts.answers == answers_before or status is None:  # none came; `_runs` judges one that did
             raise PebbleError(f"no answer within {scripts.answer_s:g} s: is the robot up?")
         if not _runs(before, status, file):
             raise PebbleError(shown(status.error or f"{file} does not run"))

@@ -24,9 +24,10 @@ class GyroHeading:
         self._mcu_ms: int | None = None  # of the newest sample, by the board's clock
         self._at = float("-inf")  # when it came
         self._limited = False  # a turn since the last call of :meth:`take` was too fast for the sensor
-        # Sums since the sensor was last judged: of its turns, + in the direction of the wheels, and of theirs, all +.
+        # Sums since the sensor was last judged: of its turns, negative where they are against those of the wheels, and
+        # of the wheels' turns without their signs.
         self._agreed_rad = self._compared_rad = 0.0
-        self._trusted = True
+        self._trusted = True  # until it contradicts the wheels; then never again
 
     def sample(self, z_dps: float, mcu_ms: int, now: float, *, at_rest: bool) -> None:
         """Add a sample; ``at_rest``: no wheel turns, so it shows the bias."""

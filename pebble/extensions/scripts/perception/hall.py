@@ -251,7 +251,7 @@ class HallWheel:
             added = tracker.update_pair(math.atan2(level, -second), sample.power)  # see _sign_of_second
         else:
             added = tracker.update(level, sample.power)
-            if sample.direction == 0:  # which one sensor alone does not show
+            if sample.direction == 0:  # not known: the single sensor does not show it
                 counts.unknown_rad += abs(added)
                 return
         counts.rad += added

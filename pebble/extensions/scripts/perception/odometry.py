@@ -170,8 +170,8 @@ class Odometry:
     def __init__(self, settings: OdometrySettings, now: float) -> None:
         self.pose = self._base = WheelPose()  # the base: where the present part begins
         self.distance_mm = 0.0
-        self._part = _Part()
-        self._was_ready = True  # with the last sample
+        self._part = _Part()  # the way since the base
+        self._was_ready = True  # at the last sample no sensor was in its warm-up, which may correct the part
         self._settings = settings
         self._directions = Directions(now)
         self._left, self._right = map(_Wheel, settings.step_mm)
@@ -214,8 +214,8 @@ class Odometry:
         part.turn_rad += turn if measured is None else measured
         self.pose = part.end(self._base)
         is_ready = self._left.hall.ready and self._right.hall.ready
-        if is_ready:  # no warm-up of a sensor can correct the part any more
-            if self.moving(now) or not self._was_ready:  # at rest, motion is noise; that of a warm-up counts
+        if is_ready:  # no sensor is warming up, which could still correct the part: it is complete
+            if self.moving(now) or not self._was_ready:  # at rest, motion is noise; but a warm-up's part counts
                 self.distance_mm += abs(part.ahead_mm)
             self._base, self._part = self.pose, _Part()
         self._was_ready = is_ready

@@ -106,11 +106,11 @@ class DriveSender:
         self._owners = {**remembered, **states}  # an owner that is gone for a while may come back restarted
         latched = [state for state in states.values() if state.latched]
         self._latched = max(latched, key=lambda state: state.since, default=None)
-        last_barred = [state.last_barred for state in states.values()]  # an owner bars all runs up to that number
-        barring = [run for run in last_barred if not newer(self.run, run)]  # this run, or newer: they bar it
-        if any(run != self.run for run in barring):  # beyond this run: so a newer one has begun
+        # An owner bars all runs up to a number. This run is barred if that is its own number, or a newer one.
+        barred = [state.last_barred for state in states.values() if not newer(self.run, state.last_barred)]
+        if any(run != self.run for run in barred):  # a newer run is barred, too: so one has begun
             self._superseded = True
-        elif barring and self._barred_at is None:
+        elif barred and self._barred_at is None:  # by a person, unless a newer run shows itself soon: see `ended`
             self._barred_at = now
 
     # -- what follows

@@ -73,7 +73,7 @@ class Neighbour:
                 f"{self.name} does not let {self._me} drive it: its config needs "
                 f'services.neighbours.commanded: {{"{self._me}": ["{DRIVE.metric}"]}}'
             )
-        own_refusal = self._own.wheels.drive_another()  # notes the attempt; a refusal here holds there as well
+        own_refusal = self._own.wheels.drive_another()  # what refuses this run here, refuses it there
         refusal = own_refusal or self.why_refused
         if command.moves and refusal:
             return False

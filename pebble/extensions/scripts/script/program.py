@@ -15,7 +15,7 @@ from pebble.config import Config, load
 from pebble.contract.payloads import LAST_RUN, LONGEST_SUMMARY, MOST_MAIN
 from pebble.errors import ConfigError, PebbleError, TransportError
 from pebble.extensions.operator.running import launcher_runs
-from pebble.extensions.scripts.runs import CONFIG, RUN, LocalScripts, next_run
+from pebble.extensions.scripts.runs import CONFIG, RUN, LocalScriptsLock, next_run
 from pebble.extensions.scripts.script.guard import END_S, Guard
 from pebble.extensions.scripts.script.options import OneLineParser, form, parse
 from pebble.extensions.scripts.script.robot import EXIT_ENDED, Robot
@@ -168,7 +168,7 @@ class _Program:
     def run(self, main: Callable[..., None], config_path: Path, arguments: tuple[msgspec.Struct, ...]) -> None:
         Guard(self._end_on_signal)  # its own thread ends the run at a signal
         config = load(config_path, lenient=True)  # as the launcher does, which runs the robot
-        LocalScripts(config).hold()  # until the process ends
+        LocalScriptsLock(config).hold()  # until the process ends
         transport = _connected(config, config_path)
         robot = self._robot = Robot(
             config, transport, _numbered(config), name=self._name, on_ended=self._end_run, drives=self._drives

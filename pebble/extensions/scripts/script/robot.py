@@ -198,7 +198,7 @@ class Robot:
         self._check()
         neighbour = self._neighbours.get(name)
         if neighbour is None:
-            section = getattr(self.config.services, "neighbours", None)  # with its extension
+            section = getattr(self.config.services, "neighbours", None)  # None: its extension is not installed
             if section is None or not section.enabled or name not in section.listens:
                 raise PebbleError(f'robot.neighbour: {name!r} is not in services.neighbours.listens: add "{name}": []')
             latest = _Latest(partial(self._subscribe_to, name), self._clock)

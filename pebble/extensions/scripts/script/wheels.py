@@ -104,7 +104,7 @@ class Wheels:
     def _report(self, refusal: str) -> None:
         """Log when commands begin to have an effect, and when they no longer have one."""
         before, self._reported = self._reported, refusal
-        if refusal in (before, ENDED):  # the reason of the end follows
+        if refusal in (before, ENDED):  # no news; or the run has ended: `on_ended` gets the reason soon
             return
         if refusal:
             log.warning("%s does not obey this script: %s", self._robot, refusal)

@@ -124,7 +124,7 @@ def driven_ms(commands: Sequence[Command], entries: Sequence[Entry]) -> list[flo
 
 
 def cells_of(subject: str, trial: str, report: Report, entries: Sequence[Entry]) -> Iterator[Cell]:
-    """Yield the results of a subject in one trial; ``entries`` are from its MCU."""
+    """Yield the results of a subject in one trial; ``entries`` are from its MCU. ``heard`` None: media not measured."""
     params = {"trial": trial}
     if report.heard is not None:
         yield round_cell(subject, DELIVERED, "%", [report.heard.delivered_percent], params)

@@ -178,7 +178,10 @@ def measure(settings: Settings, progress: Progress, ended: list[str]) -> Iterato
 
 
 def _trials(settings: Settings, robots: Sequence[ImpairedRobot], progress: Progress, ended: list[str]) -> list[Cell]:
-    """Return the results of all trials. To limit the load, only robots of one form (encodings) run at a time."""
+    """Return the results of all trials; ``ended``: see :func:`measure`.
+
+    To limit the load, only robots of one form (encodings) run at a time.
+    """
     cells: list[Cell] = []
     by_form = grouped(robots, lambda robot: robot.subject.partition(" ")[2])
     with ThreadPoolExecutor(len(robots), thread_name_prefix="subject") as pool:

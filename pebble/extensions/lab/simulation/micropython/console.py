@@ -124,7 +124,10 @@ class Output:
         return mask & POLLOUT if console.reading or console.writable() else 0
 
     def write(self, data: Any, start: int = 0, length: int | None = None) -> int:
-        """Write, as ``write(data)`` or ``write(data, offset, length)``; return the number of bytes written."""
+        """Write, as ``write(data)`` or ``write(data, offset, length)``; return how much of ``data`` was written.
+
+        Text counts as written, even if the host reads nothing.
+        """
         data = data if length is None else data[start : start + length]
         if not self._text:
             return self._console.write(data)

@@ -103,7 +103,7 @@ class Renderer:
         edges = np.array([(surface.left, surface.right) for surface in surfaces])
         plan = self._to_camera(edges, me)
         (ahead1, right1), (ahead2, right2) = plan[:, 0].T, plan[:, 1].T
-        shows_front = right2 * ahead1 - right1 * ahead2 > 0
+        shows_front = right2 * ahead1 - right1 * ahead2 > 0  # its left edge is seen to the left of its right one
         slope = (self._width / 2 + _BESIDE_PX) / self._focal
         share_from, share_to = np.zeros(len(plan)), np.ones(len(plan))
         # The near plane, then the right and the left edge of the view. Each cuts a surface to the share (0 to 1 of its

@@ -62,10 +62,10 @@ class HostNetwork:
     def __init__(self, clock: Clock, *, platform: Platform = "esp32") -> None:
         self.clock = clock
         self.radio = Radio(clock.now, platform)
-        self.new_sockets: list[socket.socket] = []
+        self.new_sockets: list[socket.socket] = []  # this machine's, for TCP, until that program has taken them
         self.unread = False
         self.problem = ""  # of the last connection, as text
-        self.open: list[BoardSocket] = []
+        self.open: list[BoardSocket] = []  # all that the firmware has not closed
         self.servers = Servers()
 
     def modules(self) -> dict[str, Any]:
@@ -139,9 +139,9 @@ class HostTcp(BoardSocket, Stream):
         self._sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self._sock.setblocking(False)
         self._poll = select.poll()
-        self._poll.register(self._sock, 0)
+        self._poll.register(self._sock, 0)  # `ready` sets the events
         self._established = False
-        network.new_sockets.append(self._sock)
+        network.new_sockets.append(self._sock)  # which the program that runs the board watches
 
     def close(self) -> None:
         super().close()

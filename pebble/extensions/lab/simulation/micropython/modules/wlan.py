@@ -96,8 +96,8 @@ def network_module(radio: Radio) -> SimpleNamespace:
     never_joins = Radio(lambda: 0.0, radio.platform)  # its clock stands still
     interfaces = {Wlan.IF_STA: Wlan(radio), Wlan.IF_AP: Wlan(never_joins)}
 
-    def wlan(interface: int = Wlan.IF_STA) -> Wlan:
+    def wlan(interface: int = Wlan.IF_STA) -> Wlan:  # a function, as each call returns the one object of an interface
         return interfaces[interface]
 
-    wlan.PM_NONE = Wlan.PM_NONE  # type: ignore[attr-defined]
+    wlan.PM_NONE = Wlan.PM_NONE  # type: ignore[attr-defined]  # firmware takes WLAN for a class, and reads WLAN.PM_NONE
     return SimpleNamespace(WLAN=wlan, STA_IF=Wlan.IF_STA, AP_IF=Wlan.IF_AP)
