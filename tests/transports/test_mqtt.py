@@ -6,6 +6,7 @@ import logging
 import re
 import shutil
 import socket
+import ssl
 import subprocess
 import threading
 import time
@@ -24,6 +25,7 @@ from pebble.transports.hosts import Address
 from pebble.transports.mqtt import refused_topics
 from pebble.transports.mqtt.client import Client, Opening
 from pebble.transports.mqtt.connection import UNACKED_LIMIT, UNACKED_RESERVE
+from pebble.transports.mqtt.ending import unreached
 from pebble.transports.tls import make_context
 from tests.support import ROOT, WAIT_S, Broker, RefusingBroker, beside, free_port, quickly, until
 from tests.tcp_proxy import BridgelessProxy, ForbiddingProxy, Hole, SlowTcpProxy, TcpProxy
@@ -455,7 +457,7 @@ def test_a_handshake_may_take_long_while_bytes_arrive(tls_broker: Broker, goes_o
         ),
         ("localhost", {"client_cert": None, "client_key": None}, ""),  # the broker wants one
         ("localhost", None, "if this port is for TLS: mqtts://"),
-        ("plain", {}, "it takes no TLS at this port; use mqtt://"),
+        ("plain", {}, "it answers no TLS; if this port is not for TLS: mqtt://"),
     ],
 )
 def test_tls_checks_host_name_and_authority_and_shows_a_certificate(
@@ -467,6 +469,16 @@ def test_tls_checks_host_name_and_authority_and_shows_a_certificate(
     client.open(0.3)
     assert until(lambda: client.problem and problem in client.problem)
     assert client.state is State.CONNECTING
+
+
+@pytest.mark.parametrize(
+    ("code", "fix"),
+    [(9, "set the clock of this machine"), (10, "renew it"), (19, "name its authority: --ca-cert FILE")],
+)
+def test_a_certificate_that_is_refused_is_named_with_its_fix(code: int, fix: str) -> None:
+    error = ssl.SSLCertVerificationError()
+    error.verify_code, error.verify_message = code, "why."
+    assert unreached(error, tls=True).startswith(f"its certificate is refused: why; {fix}")
 
 
 @pytest.mark.parametrize(

@@ -7,13 +7,14 @@ from pebble.transports.mqtt.bridge_mode import Result
 
 #: What to do if a broker hangs up on a CONNECT without TLS, and if it hangs up on TLS.
 WANTS_TLS: Final = "if this port is for TLS: mqtts://, or tls.enabled in a config"
-_NO_TLS: Final = "use mqtt://, or the port for TLS (8883)"
+_NO_TLS: Final = "if this port is not for TLS: mqtt://, or the port for TLS (8883)"
 _OTHER_NAME: Final = "name the host as it does"
+_EARLY: Final = "set the clock of this machine"
 _EXPIRED: Final = "renew it"
 _UNKNOWN: Final = "name its authority: --ca-cert FILE, tls.ca_cert"
 #: How to mend a certificate that is refused, by OpenSSL's number of the reason; by default its authority is not known.
-_CERTIFICATE: Final = {10: _EXPIRED, 62: _OTHER_NAME, 64: _OTHER_NAME}
-TLS_FIXES: Final = (WANTS_TLS, _NO_TLS, _OTHER_NAME, _EXPIRED, _UNKNOWN)
+_CERTIFICATE: Final = {9: _EARLY, 10: _EXPIRED, 62: _OTHER_NAME, 64: _OTHER_NAME}
+TLS_FIXES: Final = (WANTS_TLS, _NO_TLS, _OTHER_NAME, _EARLY, _EXPIRED, _UNKNOWN)
 
 
 class Lost(Exception):  # noqa: N818  (an event, not a mistake)
@@ -48,5 +49,5 @@ def unreached(error: Exception, *, tls: bool) -> str:
         fix = _CERTIFICATE.get(error.verify_code, _UNKNOWN)
         return f"its certificate is refused: {error.verify_message.rstrip('.')}; {fix}"
     if tls and (isinstance(error, ConnectionError | ssl.SSLEOFError) or "WRONG_VERSION" in str(error)):
-        return f"it takes no TLS at this port; {_NO_TLS}"
+        return f"it answers no TLS; {_NO_TLS}"
     return getattr(error, "strerror", None) or str(error)

@@ -1,12 +1,19 @@
-"""Lines about what a command waits for."""
+"""Lines about what a command waits for, and has not done; and a thread for lines."""
 
+import logging
+import queue
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
+import typer
+
 from pebble.config.secret_text import without_secrets
 from pebble.config.visible import shown
+from pebble.errors import PebbleError
+
+log = logging.getLogger(__name__)
 
 PATIENCE_S = 1.0  # for which a command may be silent
 _LAST_S = 0.1  # for a line that is being printed: a terminal that stands still holds up nothing else
@@ -14,7 +21,7 @@ _LAST_S = 0.1  # for a line that is being printed: a terminal that stands still 
 
 def say(text: str) -> None:
     """Print a line to stderr."""
-    with suppress(OSError):  # nobody reads it
+    with suppress(OSError):  # its reader has ended
         sys.stderr.write(f"pebble: {shown(without_secrets(text))}\n")
         sys.stderr.flush()
 
@@ -35,3 +42,42 @@ def noticed(line: Callable[[], str], after_s: float = PATIENCE_S) -> Iterator[No
     finally:
         timer.cancel()
         timer.join(_LAST_S)
+
+
+@contextmanager
+def or_undone(undone: str) -> Iterator[None]:
+    """Raise PebbleError that begins with ``undone`` instead of any error, and instead of an interrupt."""
+    try:
+        yield
+    except (KeyboardInterrupt, typer.Abort):
+        raise PebbleError(f"{undone}: interrupted") from None
+    except PebbleError as error:
+        raise PebbleError(f"{undone}: {error}") from None
+    except Exception:
+        log.exception("an unexpected error")
+        raise PebbleError(f"{undone}: an unexpected error, see above") from None
+
+
+class PrintingThread:
+    """A thread that prints in turn, so that a terminal that stands still holds up nothing else."""
+
+    def __init__(self) -> None:
+        self._prints = queue.SimpleQueue[Callable[[], None] | None]()
+        self._thread = threading.Thread(target=self._work, name="pebble-print", daemon=True)
+        self._thread.start()
+
+    def run(self, prints: Callable[[], None]) -> None:
+        """Call ``prints`` after all earlier ones."""
+        self._prints.put(prints)
+
+    def close(self, wait_s: float | None = None) -> None:
+        """End when all is printed; wait for that, if ``wait_s`` is given at most so long."""
+        self._prints.put(None)
+        self._thread.join(wait_s)
+
+    def _work(self) -> None:
+        for prints in iter(self._prints.get, None):
+            try:
+                prints()
+            except Exception:  # such as a character that the terminal does not have
+                log.exception("a line cannot be printed")

@@ -13,7 +13,7 @@ from pebble.config.hosts import is_loopback
 from pebble.errors import PebbleError
 from pebble.extensions.checks.commands.checks import Printer, is_clear
 from pebble.extensions.checks.new_file import why_taken, write_new
-from pebble.extensions.operator.commands.estop import me
+from pebble.extensions.operator.client.connection import me
 from pebble.extensions.operator.commands.options import CaCert, PasswordFile, RootOption
 from pebble.extensions.operator.commands.target import broker_of
 from pebble.extensions.operator.places import Places

@@ -9,10 +9,12 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import Final
 
 from pebble.errors import TransportError
 from pebble.extensions.operator.client.named_topics import NamedTopics
+from pebble.extensions.operator.notices import PrintingThread
 from pebble.transports import Message, MqttSettings, QoS, State, Subscription, Transport, create
 
 log = logging.getLogger(__name__)
@@ -77,6 +79,7 @@ class Broker:
         self._watchers: list[Callable[[], None]] = []
         self._arrived = Arrived()  # messages that wait for :meth:`deliver`
         self._woken = False  # the event loop was told to call :meth:`deliver`
+        self._printing: PrintingThread | None = None
         #: True for the base topic of a robot that takes commands only with a name.
         self.is_named: Callable[[str], bool] = lambda _base: False
         self.names = NamedTopics(settings.username or "", lambda base: self.is_named(base))
@@ -113,6 +116,8 @@ class Broker:
 
     async def close(self) -> None:
         await asyncio.to_thread(self.transport.close)
+        if self._printing is not None:
+            self._printing.close(0.0)
 
     def on_state(self, watcher: Callable[[], None]) -> None:
         """Call ``watcher`` whenever the connection is made or lost."""
@@ -121,16 +126,17 @@ class Broker:
     def report(self, say: Callable[[str], None]) -> None:
         """Give ``say`` a line if there is no connection, and from now on when it is lost, and when it is made again.
 
-        On threads of its own: a terminal that stands still holds up no message.
+        On a thread: a terminal that stands still holds up no message.
         """
         reported = True  # the state in the last line
+        printing = self._printing = PrintingThread()
 
         def note() -> None:
             nonlocal reported
             if self.connected is not reported and self.transport.state is not State.CLOSED:
                 reported = self.connected
                 line = "connected to the broker" if reported else f"{self.problem} (trying again)"
-                threading.Thread(target=say, args=(line,), name="pebble-say", daemon=True).start()
+                printing.run(partial(say, line))
 
         self.on_state(note)
         note()

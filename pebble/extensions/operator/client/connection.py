@@ -1,8 +1,10 @@
 """A command's short-lived connection to a robot's local transport or to a broker."""
 
+import getpass
 import logging
 import os
 import queue
+import socket
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
@@ -159,6 +161,15 @@ def resolve(target: Target) -> tuple[str, Any, Names, str]:
 def _account(settings: Any) -> str | None:
     """Return the account at the broker: "" for none; None without a broker."""
     return settings.username or "" if isinstance(settings, MqttSettings) else None
+
+
+def me(account: str | None = None) -> str:
+    """Return the sender of this command, such as ``ann@desk``: the account (without one, the user) at this machine."""
+    try:
+        user = account or getpass.getuser()
+    except (ImportError, KeyError, OSError):  # no name for this user id, or no such ids
+        user = "unknown"
+    return f"{user}@{socket.gethostname()}"
 
 
 def put_account_into_topics(transport: Transport, names: Names, is_named: Callable[[str], bool]) -> None:

@@ -10,10 +10,15 @@ import typer
 from pebble.errors import PebbleError
 from pebble.extensions.operator.client.assumed import RISK
 from pebble.extensions.operator.client.broker import problem_of
-from pebble.extensions.operator.client.connection import Target, connected, put_account_into_topics, target_of
+from pebble.extensions.operator.client.connection import (
+    Target,
+    connected,
+    me,
+    put_account_into_topics,
+    target_of,
+)
 from pebble.extensions.operator.client.terminal.key_decoder import END
 from pebble.extensions.operator.client.terminal.keys import Terminal, has_terminal, opened
-from pebble.extensions.operator.commands.estop import me
 from pebble.extensions.operator.commands.options import RobotArgument
 from pebble.extensions.operator.commands.target import with_target
 from pebble.extensions.page.commands.terminal_driver import PERIOD_S, TerminalDriver
@@ -87,6 +92,7 @@ def _drive(transport: Transport, driver: TerminalDriver, terminal: Terminal) -> 
     finally:
         began = clock()
         driver.end(began, leave=True)
+        tick()  # before a line that a terminal may hold up
         if driver.unconfirmed:
             terminal.show(lambda: f"{driver.name}: the emergency stop is sent for {_STOP_S:g} s more", at_once=True)
         while clock() < began + (_STOP_S if driver.unconfirmed else _ZEROS_S):

@@ -54,8 +54,8 @@ def info(places: RecordingsArgument, since: Since = None, until: Until = None, c
     if filled:
         begin, end = min(info.first_ns for info in filled), max(info.last_ns for info in filled)
         typer.echo(f"{local_time(begin)} to {local_time(end)} ({show.duration((end - begin) / 1e9)})")
-    own = f" and {show.counted(notes, 'note')} of the recorder" if notes else ""
-    typer.echo(f"{show.counted(messages, 'message')}{own}, {show.size(size)} in {show.counted(len(looked), 'file')}")
+    also = f" and {show.counted(notes, 'note')} of the recorder" if notes else ""
+    typer.echo(f"{show.counted(messages, 'message')}{also}, {show.size(size)} in {show.counted(len(looked), 'file')}")
     missing = sum(info.missing for info in looked)
     if missing:
         typer.echo(f"{missing:,} messages are missing: files were damaged")
@@ -148,7 +148,7 @@ def _lane(path: Path) -> str:
 
 
 def _state(info: FileInfo) -> str:
-    """Return what distinguishes a file from a finished, undamaged one, the most telling of it; "" if nothing does."""
+    """Return the first of these states that is a file's; "" if it is finished and undamaged."""
     if info.is_active:
         return "being written"
     if info.missing:

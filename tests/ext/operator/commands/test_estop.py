@@ -19,7 +19,9 @@ from typing import Any
 
 import pytest
 
-from pebble.extensions.operator.commands import estop
+from pebble.extensions.operator.client.connection import me
+from pebble.extensions.operator.commands import estop, repeated_stop
+from pebble.transports.mqtt.transport import MqttTransport
 from tests.commands.command_line import Run, config_file, program, running
 from tests.ext.page.served import Served
 from tests.fakes.bad_brokers import BEHAVIOURS, resolving, serving
@@ -85,7 +87,7 @@ def test_a_stop_is_confirmed_by_every_owner(run: Run, robot_on: Make, url: str, 
     assert robot.latched
     assert run.out.splitlines()[-1].startswith(f"{robot.id}: stopped and confirmed after 0.")
     latch = robot.motors.owners[0].latch
-    assert (latch.by, latch.why, latch.count) == (estop.me()[:32], "dog", 1)
+    assert (latch.by, latch.why, latch.count) == (me()[:32], "dog", 1)
     assert until(lambda: len(robot.received) >= 2)  # it may still be on its way when the command has ended
     first, second = robot.received[:2]
     assert (first[1], second[1]) == (f"{robot.base}/incoming/estop", f"{robot.base}/incoming/drive-values")
@@ -127,7 +129,7 @@ def test_a_stop_and_a_reset_say_whether_they_reach_the_motors(
         code, lines = run("estop", *words, url), [line for line in run.out.splitlines() if robot.id in line]
         last = re.sub(r", [^,]* ago", "", re.sub(r"\d\.\d\d s", "T", lines[-1].partition(": ")[2]))
         assert not any("stopped and confirmed" in line for line in lines[:-1])
-        codes.append((code, last.replace(estop.me()[:32], "me")))
+        codes.append((code, last.replace(me()[:32], "me")))
     assert codes == MOTORS[state]
 
 
@@ -173,10 +175,13 @@ def test_a_robot_that_does_not_answer_is_reported_and_ctrl_c_ends_it(robot_on: M
     assert robot.count("estop") == robot.count("drive-values") >= 2
 
 
-def test_the_robots_that_are_heard_are_named_where_the_one_that_is_meant_is_not(robot_on: Make, url: str) -> None:
+def test_the_robots_that_are_heard_are_named_where_the_one_that_is_meant_is_not(
+    robot_on: Make, broker: Broker, url: str
+) -> None:
     robot = robot_on("serial")
     robot.start()
-    with running("estop", "gob", url) as process:
+    page = RecordingRobot(broker.port, "pebble/servers/desk", capabilities={})
+    with page, running("estop", "gob", url) as process:
         assert process.stderr is not None
         assert process.stderr.readline() == f"pebble: nothing comes from gob; heard here: {robot.id}\n"
 
@@ -194,8 +199,10 @@ def test_a_stop_is_repeated_until_it_is_confirmed_although_nothing_can_be_printe
     assert robot.latched
 
 
-def test_a_terminal_that_stands_still_holds_no_stop_up(robot_on: Make, broker: Broker) -> None:
+@pytest.mark.parametrize("stream", ["stderr", "stdout"])
+def test_a_terminal_that_stands_still_holds_no_stop_up(robot_on: Make, broker: Broker, stream: str) -> None:
     robot = robot_on("serial")
+    robot.deaf = True
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
     with suppress(BlockingIOError):
@@ -206,9 +213,9 @@ def test_a_terminal_that_stands_still_holds_no_stop_up(robot_on: Make, broker: B
         os.fdopen(reading),
         os.fdopen(writing, "w") as unread,
         TcpProxy(broker.port, delay_s=0.3) as proxy,
-        running("estop", robot.id, f"--url=mqtt://127.0.0.1:{proxy.port}", stderr=unread),
+        running("estop", robot.id, f"--url=mqtt://127.0.0.1:{proxy.port}", **{stream: unread}),
     ):
-        assert until(lambda: robot.latched)
+        assert until(lambda: robot.count("estop") >= 4)
 
 
 def test_a_slow_network_does_not_delay_repetitions(robot_on: Make, broker: Broker) -> None:
@@ -351,7 +358,7 @@ def test_a_stop_says_also_after_an_error_whether_it_was_sent(
     def fail(*_: object) -> None:
         raise ValueError("a mistake")
 
-    monkeypatch.setattr(estop, place, fail)
+    monkeypatch.setattr(repeated_stop, place, fail)
     assert run("estop", "nobody", url) == 1
     assert ("STOP NOT SENT: an unexpected error" in run.err) is (place == "target_of")
     assert (run.out.startswith("nobody: ") and " NOT " in run.out) is (place == "_repeat")
@@ -506,8 +513,24 @@ def test_a_stop_that_was_not_shown_is_not_reset(robot_on: Make, url: str) -> Non
     assert (process.returncode, robot.latched, robot.count("estop-reset")) == (1, True, 1)
 
 
+def test_a_reset_that_some_owners_may_have_got_is_not_confirmed(
+    run: Run, robot_on: Make, url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot, publish, resets = robot_on("left", "right"), MqttTransport.publish, itertools.count()
+    robot.stop()
+
+    def publish_first(transport: MqttTransport, topic: str, *rest: Any, **options: Any) -> bool:
+        if topic.endswith("/estop-reset") and next(resets):
+            return False
+        return publish(transport, topic, *rest, **options)
+
+    monkeypatch.setattr(MqttTransport, "publish", publish_first)
+    assert run("estop", "reset", robot.id, url) == 1
+    assert run.err == f"pebble: the reset of {robot.id} is NOT CONFIRMED: the connection was lost\n"
+
+
 def test_a_reset_of_an_unknown_robot_is_a_failure(run: Run, url: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(estop, "_ANSWER_S", 0.3)
+    monkeypatch.setattr(estop, "ANSWER_S", 0.3)
     assert run("estop", "reset", "unknown", url) == 1
     assert run.err == "pebble: NOT RESET: unknown publishes no emergency stop: is it on, and is this its broker?\n"
 
