@@ -8,6 +8,8 @@ import select
 import subprocess
 import termios
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from tests.support import ROOT, WAIT_S, until
@@ -29,6 +31,7 @@ class Terminal:
         self._shown = b""
         self._answered = 0  # so much of what is shown is answered
         self._ending = threading.Event()
+        self._reading = threading.Lock()
         self._threads = [threading.Thread(target=job, daemon=True) for job in (self._read, self._repeat)]
         for thread in self._threads:
             thread.start()
@@ -87,6 +90,17 @@ class Terminal:
     def forget(self) -> None:
         self._shown, self._answered = b"", 0
 
+    @contextmanager
+    def standing_still(self) -> Iterator[None]:
+        """Show nothing, and have no room for anything more to show, as the terminal of a frozen ssh."""
+        with self._reading:
+            os.set_blocking(self._slave, False)
+            with suppress(BlockingIOError):
+                while os.write(self._slave, b"x"):
+                    pass
+            os.set_blocking(self._slave, True)
+            yield
+
     @property
     def restored(self) -> bool:
         """True if the terminal has the mode that it had before the process."""
@@ -96,7 +110,8 @@ class Terminal:
         while not self._ending.is_set():
             if select.select([self.master], [], [], 0.05)[0]:
                 try:
-                    self._shown += os.read(self.master, 65536)
+                    with self._reading:
+                        self._shown += os.read(self.master, 65536)
                 except OSError:
                     return
 

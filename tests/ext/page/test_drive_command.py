@@ -155,6 +155,29 @@ def test_an_emergency_stop_is_sent_on_after_the_terminal_has_ended(
     assert console.sees(f"the emergency stop of {lamp.id} is NOT CONFIRMED", 1) is deaf
 
 
+#: A key, and True if the robot has what it sends.
+STANDING: dict[str, tuple[bytes, Callable[[RecordingRobot], bool]]] = {
+    "space": (b" ", lambda lamp: FINAL in lamp.drives()),
+    "emergency stop": (b"!", lambda lamp: lamp.latched),
+}
+
+
+@pytest.mark.parametrize(("key", "arrives"), STANDING.values(), ids=STANDING)
+def test_a_terminal_that_stands_still_delays_nothing_and_is_restored(
+    drive: Drive, lamp: RecordingRobot, key: bytes, arrives: Callable[[RecordingRobot], bool]
+) -> None:
+    console = drive()
+    with console.standing_still():
+        time.sleep(0.3)
+        console.type(b"\x1b[C")  # it has something new to show
+        assert until(lambda: any(map(moves, lamp.drives())), SOON_S)
+        console.type(key)
+        assert until(lambda: arrives(lamp), 0.5)
+        console.type(b"\x04")
+        assert until(lambda: console.restored)
+    assert console.ends() == 0
+
+
 def test_without_a_terminal_there_is_one_line(run: Run) -> None:
     assert run("drive", "minilamp", "--url", "mqtt://127.0.0.1") == 1
     assert run.err.startswith("pebble: driving by keys needs a terminal of Linux or macOS: use `pebble web`, ")
@@ -323,7 +346,7 @@ def test_the_status_names_a_layout_without_latin_letters_and_a_script_that_drive
 #: What becomes of a request for control that bob has: his robot's state after it, the seconds, the status line.
 ASKED: dict[str, tuple[dict[str, Any], float, str]] = {
     "it waits": ({"asks": "ann", "asks_id": "{id}"}, 0.5, "asked bob for control · "),
-    "he gives it": ({"by": "ann", "id": "{id}", "key": "k2"}, 0.5, "bob lets you drive · ready"),
+    "he gives it": ({"by": "ann", "id": "{id}", "key": "k2"}, 0.5, "you have control, no longer bob · ready"),
     "he drives on": ({"asks": "ann", "asks_id": "{id}"}, 31, "bob drives on · "),
     "no answer": ({}, 31, "goob does not answer · "),
 }

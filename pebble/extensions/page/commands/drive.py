@@ -61,8 +61,7 @@ def drive(
         )
         # A robot that takes only commands with the sender's account in the topic says so, after it was subscribed to.
         put_account_into_topics(transport, names, lambda base: base == names.base and driver.robot.named)
-        typer.echo(_KEYS)
-        with opened() as terminal:
+        with opened(f"{_KEYS}\n") as terminal:
             _drive(transport, driver, terminal)
     if driver.unconfirmed:
         typer.echo(f"pebble: the emergency stop of {driver.name} is NOT CONFIRMED", err=True)
@@ -92,7 +91,7 @@ def _drive(transport: Transport, driver: TerminalDriver, terminal: Terminal) -> 
     finally:
         began = clock()
         driver.end(began, leave=True)
-        tick()  # before a line that a terminal may hold up
+        tick()
         if driver.unconfirmed:
             terminal.show(lambda: f"{driver.name}: the emergency stop is sent for {_STOP_S:g} s more", at_once=True)
         while clock() < began + (_STOP_S if driver.unconfirmed else _ZEROS_S):

@@ -147,7 +147,7 @@ class TerminalDriver:
         parts = (
             self.name,
             f"asked {view.by} for control" if view.asking and view.by else "",
-            f"{self._asked} lets you drive" if view.you and self._asked else "",
+            f"you have control, no longer {self._asked}" if view.you and self._asked else "",
             *([] if view.you else self._failures),  # ``you``: this terminal has control
             robot.itself,  # that it drives itself, by a script
             motion,
