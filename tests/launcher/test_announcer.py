@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import logging
 import os
+import pty
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -322,8 +323,9 @@ def test_the_launchers_own_records_go_the_same_way(forwarded: Forwarded) -> None
     assert written[-1] == "[WARNING] [launcher] ValueError: seven"
 
 
-def test_writing_never_waits_for_a_reader() -> None:
-    read_end, write_end = os.pipe()  # blocking, as a terminal is
+@pytest.mark.parametrize("opens", [os.pipe, pty.openpty])
+def test_writing_never_waits_for_a_reader(opens: Callable[[], tuple[int, int]]) -> None:
+    read_end, write_end = opens()  # blocking
     try:
         writer = NonBlockingWriter(write_end)
         for _ in range(1000):
