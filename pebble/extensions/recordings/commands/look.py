@@ -58,7 +58,7 @@ def info(places: RecordingsArgument, since: Since = None, until: Until = None, c
     typer.echo(f"{show.counted(messages, 'message')}{also}, {show.size(size)} in {show.counted(len(looked), 'file')}")
     missing = sum(info.missing for info in looked)
     if missing:
-        typer.echo(f"{missing:,} messages are missing: files were damaged")
+        typer.echo(f"{show.counted(missing, 'message')} missing: files were damaged")
     for robot in sorted(set().union(*(info.robots for info in looked))):
         counts = Counter({topic[len(robot) + 1 :]: n for topic, n in topics.items() if robot_of(topic) == robot})
         typer.echo(f"\n{one_line(shown(robot))}: {show.counted(counts.total(), 'message')}")

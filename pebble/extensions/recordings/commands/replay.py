@@ -16,6 +16,7 @@ from pebble.config.visible import shown
 from pebble.errors import PebbleError
 from pebble.extensions.operator.client.connection import password
 from pebble.extensions.operator.client.url import settings_of
+from pebble.extensions.operator.commands import show
 from pebble.extensions.operator.commands.options import CaCert, PasswordFile
 from pebble.extensions.operator.signals import handled_by
 from pebble.extensions.recordings.catalogue import check_name
@@ -105,7 +106,8 @@ def _read(recordings: list[Path], options: Options) -> tuple[ReplaySource, Rules
         report_unread(problems(source.damages))
         raise PebbleError("there is nothing to publish in this recording; see --only and --incoming")
     if source.missing:
-        typer.echo(f"pebble: {source.missing:,} messages are missing in this recording: files were damaged", err=True)
+        missing = show.counted(source.missing, "message")
+        typer.echo(f"pebble: {missing} missing in this recording: files were damaged", err=True)
     return source, rules
 
 

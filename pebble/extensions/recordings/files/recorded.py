@@ -81,9 +81,9 @@ class Damage:
         ``active``: the file is known to be written now, so it needs no end. Any other without an end may be, too.
         """
         reasons = [
-            (len(self.parts), f"{len(self.parts):,} damaged parts"),
-            (self.missing, f"{self.missing:,} messages missing"),
-            (self.unnamed, f"{self.unnamed:,} messages without a topic"),
+            (len(self.parts), f"damaged parts: {len(self.parts):,}"),
+            (self.missing, f"messages missing: {self.missing:,}"),
+            (self.unnamed, f"messages without a topic: {self.unnamed:,}"),
             (self.torn and not active, f"{self.torn:,} bytes at its end cannot be read"),
             (not (self.finished or active), "its end is missing or damaged, or it is being written"),
         ]

@@ -178,7 +178,7 @@ def test_what_damage_has_taken_is_counted(tmp_path: Path, at: tuple[str, str], r
     path.write_bytes(data)
     assert rewrite(path, mended).missing == 100
     assert run("replay", mended, *at, "--speed", "100") == 0
-    assert run.err == "pebble: 100 messages are missing in this recording: files were damaged\n"
+    assert run.err == "pebble: 100 messages missing in this recording: files were damaged\n"
     assert run("replay", path, *at, "--speed", "100") == 1
-    assert "1 damaged parts, 100 messages missing" in run.err
+    assert "damaged parts: 1, messages missing: 100" in run.err
     assert run.out.splitlines()[-1] == "300 sent, 0 skipped"
