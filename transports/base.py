@@ -11,7 +11,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from msgspec import Struct
 
@@ -250,6 +250,7 @@ class Transport(ABC):
     #: True if the link to the other end is thin: keep little in the kernel, where nothing can overtake it, ask less
     #: often and wait longer for answers. Set by :meth:`suit_link`; a backend may ignore it.
     is_thin: bool = False
+    settings: Any = None  # of the backend
 
     def __init__(self, client_id: str, *, will: Message | None = None) -> None:
         if will is not None:

@@ -112,16 +112,16 @@ def _as_spelled(transport: Transport, names: Names) -> Names:
 
 
 @contextmanager
-def listening(target: Target, sender: Transport) -> Iterator[Transport]:
+def listening(sender: Transport) -> Iterator[Transport]:
     """Yield a connection to the same broker as ``sender``, for receiving, so that what arrives delays no command.
 
     The new connection may not be open yet. On Zenoh, or if the config sets the client id, it is ``sender`` itself.
     """
-    kind, settings, _, _ = resolve(target)
+    settings = sender.settings
     if not isinstance(settings, MqttSettings) or settings.client_id is not None:
         yield sender
         return
-    transport = create(kind, f"pebble-tool-{os.getpid()}-listening", in_small_segments(settings))
+    transport = create("mqtt", f"pebble-tool-{os.getpid()}-listening", settings)
     with closing(transport.open(0.0)):
         yield transport
         _report_missing(transport)

@@ -110,7 +110,7 @@ def _reset(robot: str | None, target: Target) -> int:
             connection = connected(target, undone="nothing is reset yet", patience_s=NOTICE_S)
             transport, names = opened.enter_context(connection)
             # Messages of the robot come on a connection of their own if possible: they do not delay the reset.
-            receiving = opened.enter_context(listening(target, transport))
+            receiving = opened.enter_context(listening(transport))
             with noticed(lambda: "waiting for the robot's stop states"):
                 view = _viewed(transport, receiving, names)
             name = shown(id_of(view.estop.base))

@@ -15,16 +15,14 @@ from pebble.config.visible import shown
 from pebble.contract import CAPABILITIES, ESTOP_STATE, ONLINE, STATUS
 from pebble.contract.identity import parse_topic
 from pebble.contract.levels import LEVELS
-from pebble.errors import PebbleError, TransportError
+from pebble.errors import TransportError
 from pebble.extensions.operator.client.connection import (
     Listener,
     Target,
     connected,
-    in_small_segments,
     listening,
     me,
     put_account_into_topics,
-    resolve,
     target_of,
     wait_for,
 )
@@ -75,7 +73,7 @@ def stop(robot: str | None, target: Target, why: str, *, hold: bool) -> int:
             outbox.publish()  # at once, before anything else
             if hold:
                 report.say(f"stop {sender.order.name} is held until Ctrl-C; robots stay stopped after it")
-            _repeat(target, robots or [names.base], sender, outbox, report)
+            _repeat(robots or [names.base], sender, outbox, report)
         except KeyboardInterrupt:
             pass
         except Exception:
@@ -85,14 +83,14 @@ def stop(robot: str | None, target: Target, why: str, *, hold: bool) -> int:
     return 0 if sender.confirmed and not _any_cut_off(sender) else 1
 
 
-def _repeat(target: Target, bases: list[str], sender: StopSender, outbox: _Outbox, report: _Report) -> None:
+def _repeat(bases: list[str], sender: StopSender, outbox: _Outbox, report: _Report) -> None:
     """Repeat stops until they are confirmed. Listen on a second connection: what arrives delays none of them."""
     every = not sender.order.named
     with ExitStack() as opened:
-        heartbeats = _heartbeats(target, opened) if every else None
-        second = opened.enter_context(listening(target, outbox.transport))
+        heartbeats = _heartbeats(outbox.transport, opened) if every else None
+        second = opened.enter_context(listening(outbox.transport))
         listener, subscribing = _listen(second, bases)
-        others = None if every else _OtherRobots(target, sender, opened, report)
+        others = None if every else _OtherRobots(outbox.transport, sender, opened, report)
         while not sender.finished:
             for message in heartbeats.take() if heartbeats else ():
                 sender.receive(message, time.monotonic())
@@ -117,22 +115,22 @@ def _any_cut_off(sender: StopSender) -> bool:
     return any(is_cut_off(robot.driveable) for robot in sender.robots.values())
 
 
-def _heartbeats(target: Target, opened: ExitStack) -> Heartbeats | None:
-    """Return a connection for heartbeats of all robots, which ``opened`` closes.
+def _heartbeats(transport: Transport, opened: ExitStack) -> Heartbeats | None:
+    """Return another connection as ``transport``, for heartbeats of all robots, which ``opened`` closes.
 
     None with a client id from the config, with which there can be only one connection.
     """
-    _, settings, _, _ = resolve(target)
+    settings = transport.settings
     if not isinstance(settings, MqttSettings) or settings.client_id is not None:
         return None
-    return opened.enter_context(closing(Heartbeats(in_small_segments(settings))))
+    return opened.enter_context(closing(Heartbeats(settings)))
 
 
 class _OtherRobots:
     """The robots that are heard while nothing comes from the one to be stopped: its name may be mistyped."""
 
-    def __init__(self, target: Target, sender: StopSender, opened: ExitStack, report: _Report) -> None:
-        self._target, self._sender, self._opened, self._report = target, sender, opened, report
+    def __init__(self, transport: Transport, sender: StopSender, opened: ExitStack, report: _Report) -> None:
+        self._transport, self._sender, self._opened, self._report = transport, sender, opened, report
         self._due = time.monotonic() + _QUICK_S
         self._heartbeats: Heartbeats | None = None
 
@@ -142,8 +140,7 @@ class _OtherRobots:
             return
         self._due = float("inf")
         if self._heartbeats is None:
-            with suppress(PebbleError):  # the config is gone
-                self._heartbeats = _heartbeats(self._target, self._opened)
+            self._heartbeats = _heartbeats(self._transport, self._opened)
             if self._heartbeats is not None:
                 self._due = now + _OTHERS_S
             return

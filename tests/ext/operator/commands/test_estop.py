@@ -19,6 +19,7 @@ from typing import Any
 
 import pytest
 
+from pebble.config import Config, load
 from pebble.extensions.operator.client.connection import me
 from pebble.extensions.operator.commands import estop, repeated_stop
 from pebble.transports.mqtt.transport import MqttTransport
@@ -421,6 +422,22 @@ def test_a_config_file_leads_to_the_robots_own_side_and_to_the_remote_one(
     remote = config_file(tmp_path, robot={"id": robot.id}, local_mqtt=nowhere, services={"mqtt_bridge": bridge})
     assert run("estop", remote, "--remote") == 0
     assert robot.latched
+
+
+def test_a_config_file_that_vanishes_ends_no_stop(
+    run: Run, robot_on: Make, broker: Broker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = robot_on("serial")
+    file = Path(config_file(tmp_path, robot={"id": robot.id}, local_mqtt={"host": "127.0.0.1", "port": broker.port}))
+
+    def load_once(path: Path, **options: Any) -> Config:
+        config = load(path, **options)
+        file.unlink()
+        return config
+
+    monkeypatch.setattr("pebble.extensions.operator.client.connection.load", load_once)
+    assert run("estop", file) == 0
+    assert ": stopped and confirmed after " in run.out
 
 
 @pytest.mark.parametrize(
