@@ -6,6 +6,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 
 import typer
 
@@ -17,6 +18,7 @@ log = logging.getLogger(__name__)
 
 PATIENCE_S = 1.0  # for which a command may be silent
 _LAST_S = 0.1  # for a line that is being printed: a terminal that stands still holds up nothing else
+_MOST = 1000  # prints that wait
 
 
 def say(text: str) -> None:
@@ -59,16 +61,20 @@ def or_undone(undone: str) -> Iterator[None]:
 
 
 class PrintingThread:
-    """A thread that prints in turn, so that a terminal that stands still holds up nothing else."""
+    """A thread that prints in turn, so that a terminal that stands still holds up nothing else.
+
+    Of more than _MOST prints that wait, the newest are dropped.
+    """
 
     def __init__(self) -> None:
-        self._prints = queue.SimpleQueue[Callable[[], None] | None]()
+        self._prints = queue.SimpleQueue[Callable[[], object] | None]()
         self._thread = threading.Thread(target=self._work, name="pebble-print", daemon=True)
         self._thread.start()
 
-    def run(self, prints: Callable[[], None]) -> None:
+    def run(self, prints: Callable[[], object]) -> None:
         """Call ``prints`` after all earlier ones."""
-        self._prints.put(prints)
+        if self._prints.qsize() < _MOST:
+            self._prints.put(prints)
 
     def close(self, wait_s: float | None = None) -> None:
         """End when all is printed; wait for that, if ``wait_s`` is given at most so long."""
@@ -81,3 +87,29 @@ class PrintingThread:
                 prints()
             except Exception:  # such as a character that the terminal does not have
                 log.exception("a line cannot be printed")
+
+
+@contextmanager
+def printing_thread() -> Iterator[PrintingThread]:
+    """Yield a thread that prints, also what this process logs meanwhile; at the end wait a moment for it."""
+    printing = PrintingThread()
+    pebble, last = logging.getLogger("pebble"), logging.lastResort  # the last: of what has no other handler
+    handlers = pebble.handlers
+    pebble.handlers = [_LaterHandler(handler, printing) for handler in handlers]
+    logging.lastResort = None if last is None else _LaterHandler(last, printing)
+    try:
+        yield printing
+    finally:
+        pebble.handlers, logging.lastResort = handlers, last
+        printing.close(PATIENCE_S)
+
+
+class _LaterHandler(logging.Handler):
+    """A handler of log records that another one prints, on a thread."""
+
+    def __init__(self, handler: logging.Handler, printing: PrintingThread) -> None:
+        super().__init__(handler.level)
+        self._handler, self._printing = handler, printing
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._printing.run(partial(self._handler.handle, record))

@@ -6,12 +6,14 @@ import io
 import json
 import os
 import signal
+import socket
 import ssl
 import stat
 import subprocess
 import sys
 import urllib.request
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +28,8 @@ from pebble.extensions.operator.client import page_packages
 from pebble.extensions.page import run as process
 from pebble.extensions.page.setting import WebSettings, settings_of
 from tests.commands.command_line import Run, config_file, program
-from tests.support import ROOT, WAIT_S, Broker, Child, free_port
+from tests.kit.terminal import Terminal
+from tests.support import ROOT, SOON_S, WAIT_S, Broker, Child, free_port
 
 SECRET = "sentinel-8472"
 BROKER = {"services": {"mqtt_bridge": {"remote_mqtt": {"host": "broker.example"}}}}
@@ -52,6 +55,20 @@ def served(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[WebSettings]]:
 
 def give(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
     monkeypatch.setattr("sys.stdin", io.StringIO(text))
+
+
+def test_a_terminal_that_stands_still_delays_no_answer_to_a_page(broker: Broker) -> None:
+    port = free_port()
+    console = Terminal(sys.executable, "-m", "pebble", "web", f"--url=mqtt://127.0.0.1:{broker.port}", f"--port={port}")
+    with closing(console):
+        assert console.sees("(Ctrl-C ends it)"), console.shown
+        with console.standing_still():
+            for _ in range(2):  # of each a line is printed
+                with socket.create_connection(("127.0.0.1", port), SOON_S) as stranger:
+                    stranger.sendall(b"no request\r\n\r\n")
+                    assert stranger.recv(100).startswith(b"HTTP/1.1 400")
+            assert urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=SOON_S).status == 200
+        assert console.sees("Invalid HTTP request received.")
 
 
 # -- where it may be served

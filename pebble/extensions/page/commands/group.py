@@ -6,6 +6,7 @@ import getpass
 import signal
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,7 +23,7 @@ from pebble.extensions.fleet.people import has_user
 from pebble.extensions.operator.client.page_packages import require_packages
 from pebble.extensions.operator.commands.options import BrokerUrl, CaCert, PasswordFile, host_of
 from pebble.extensions.operator.commands.target import broker_of
-from pebble.extensions.operator.notices import say
+from pebble.extensions.operator.notices import printing_thread, say
 from pebble.extensions.operator.signals import until_ended
 from pebble.extensions.page.commands.people import TLS, PeopleOption, default_folder, register_people
 from pebble.extensions.page.config import PEOPLE, WebInterface, WebTls
@@ -215,8 +216,9 @@ def _run(settings: WebSettings) -> int:
     hangups = [number for number in ending_signals() if number.name == "SIGHUP"]  # none on Windows or under nohup
     for number in hangups:  # the terminal was closed: end as with Ctrl-C, which stops what pages move
         signal.signal(number, lambda *_: signal.raise_signal(signal.SIGINT))
-    with until_ended():  # uvicorn raises SIGTERM again once it has ended in order
-        run(replace(settings, say=say), on_ready=lambda url: _print_ready(settings, url))
+    # Uvicorn raises SIGTERM again once it has ended in order. A terminal that stands still holds up no stop of a page.
+    with until_ended(), printing_thread() as printing:
+        run(replace(settings, say=say), on_ready=lambda url: printing.run(partial(_print_ready, settings, url)))
     return 0
 
 
