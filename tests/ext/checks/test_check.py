@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from pebble.extensions.checks.check import some_of
 from pebble.extensions.checks.report import report
 from pebble.extensions.checks.report.report import make
 from pebble.extensions.checks.report.secrets_here import secrets_of, values_in
@@ -41,6 +42,10 @@ def test_check_reads_the_certificates(run: Run, tmp_path: Path) -> None:
         "services.mqtt_bridge.remote_mqtt.tls.ca_cert",
     ], "local_mqtt is not in use"
     assert f"remote_mqtt.tls.ca_cert: {tmp_path / 'ca.pem'} cannot be used: " in run.err
+
+
+def test_of_many_names_three_are_shown() -> None:
+    assert [some_of("abc"), some_of("abcd")] == ["a, b, c", "a, b, c, and 1 more"]
 
 
 def test_it_needs_a_config(run: Run) -> None:

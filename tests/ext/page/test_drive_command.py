@@ -26,8 +26,9 @@ Drive = Callable[..., Terminal]
 
 
 @pytest.fixture
-def lamp(broker: Broker) -> Iterator[RecordingRobot]:
-    with RecordingRobot(broker.port, f"pebble/robots/lamp{next(NUMBERS)}", keeps=True) as one:
+def lamp(broker: Broker, request: pytest.FixtureRequest) -> Iterator[RecordingRobot]:
+    named = getattr(request, "param", False)
+    with RecordingRobot(broker.port, f"pebble/robots/lamp{next(NUMBERS)}", keeps=True, named=named) as one:
         yield one
 
 
@@ -96,6 +97,12 @@ def test_a_held_key_drives_and_its_release_stops(drive: Drive, lamp: RecordingRo
     assert console.process.wait(WAIT_S) == 0
     assert console.restored
     assert until(lambda: owner.by == "")
+
+
+@pytest.mark.parametrize("lamp", [True], indirect=True, ids=["named"])
+def test_where_commands_need_a_name_they_have_that_of_the_account(drive: Drive, lamp: RecordingRobot, url: str) -> None:
+    driving(drive("--url", url.replace("//", "//ann@")), lamp)
+    assert f"{lamp.base}/incoming/by/ann/drive-values" in lamp.wire
 
 
 #: What ends a drive, and the exit status; None: the program goes on.

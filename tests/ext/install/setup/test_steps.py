@@ -17,7 +17,7 @@ import pytest
 from pebble.extensions.install.commands import setup as command
 from pebble.extensions.install.setup import system
 from pebble.extensions.install.setup.robot_config import changed
-from pebble.extensions.install.setup.system import MOSQUITTO, ROBOT, SetupError, System
+from pebble.extensions.install.setup.system import MOSQUITTO, ROBOT, ROBOTS, SetupError, System
 from pebble.extensions.operator.places import Places
 from tests.commands.command_line import Run
 from tests.ext.install.setup.conftest import ANSWERS, PASSWORD, answers_in, in_child, machine_root, set_up, tree
@@ -29,8 +29,10 @@ RESTARTS = ["systemctl restart mosquitto.service", "systemctl restart pebble.ser
 
 def test_a_second_run_finds_all_as_it_should_be(root: Path, tmp_path: Path, run: Run) -> None:
     answers = answers_in(tmp_path)
+    (root / "usr/lib/polkit-1/polkitd").unlink()
     assert run("setup", "--answers", answers) == 1
     assert run.out.count("Failed: systemd does not run here, so nothing starts the robot") == 1
+    assert run.out.count("Note: polkit is not installed") == 1
     before = tree(root)
     assert run("setup", "--answers", answers) == 1
     assert "All is so already." in run.out
@@ -149,7 +151,7 @@ def test_no_password_is_shown_or_stored_but_where_it_belongs(root: Path, tmp_pat
 # -- as root
 
 
-OWNERS = {ROBOT: (65534, 65534), MOSQUITTO: (1, 1)}
+OWNERS = {ROBOT: (65534, 65534), ROBOTS: (0, 65534), MOSQUITTO: (1, 1)}
 _ACTS = (
     "open",
     "sqlite3.connect",
@@ -228,3 +230,4 @@ def test_in_folders_of_others_root_is_their_owner(
         assert (people.parent / "tls/ca.key").stat().st_uid == OWNERS[ROBOT][0]
         assert Places(other).people.stat().st_uid == OWNERS[ROBOT][0]
         assert {path.lstat().st_uid for path in Places(other).broker_folder.iterdir()} == {OWNERS[MOSQUITTO][0]}
+        assert {path.stat().st_gid for path in Places(here).etc.iterdir()} == {OWNERS[ROBOTS][1]}, "the robot reads it"

@@ -405,3 +405,5 @@ def test_robots_stop_each_other_and_neither_is_pushed() -> None:
     driven(4.0, 1, 1, world)
     assert world.robots["fred"].pose == fred
     assert world.robots["goob"].pose.x == pytest.approx(0.8, abs=1e-4)
+    world.robots["fred"].place(2.0, 0.0, 0.0)
+    assert driven(1.0, 1, 1, world).robots["goob"].pose.x > 0.9, "it was lifted out of the way"
