@@ -233,7 +233,7 @@ class TestDisk:
         monkeypatch.setattr(recorders, "QUEUE_BYTES", 300_000)
         running = Running(tmp_path / "rec")
         running.send()
-        assert until(lambda: running.recorder.waiting == 0)
+        assert until(lambda: running.recorder.counters["written"])
         with quickly():
             for _ in range(150):
                 running.send(topic=CAMERA, payload=PICTURE + bytes(5000))
