@@ -33,5 +33,5 @@ class Heartbeat:
         transport.publish(self.topic, payload, qos=self._qos if qos is None else QoS(qos), retain=self._retain)
 
     def is_ours(self, message: Message) -> bool:
-        """True if we have sent exactly this heartbeat. Another program may send an equal one by chance."""
+        """True if we have sent an equal payload: ours has come back, or another program has sent the same."""
         return message.topic == self.topic and message.payload in tuple(self._sent)

@@ -205,9 +205,9 @@ def metrics(right: Right, extra: Extra | None = None) -> tuple[str, ...]:
 
 
 def covered(right: Right, filter_: str) -> str:
-    """Return a metric of the contract that ``filter_`` covers, but that ``right`` may not write.
+    """Return a metric of the contract that ``filter_`` matches and that ``right`` may not write, or "".
 
-    Empty if there is none: then :class:`Extra` may grant ``filter_`` to this right.
+    A fleet's file (:class:`Extra`) may let a right write further filters, but none of those: it would get more power.
     """
     for channel in c.CHANNELS:
         if channel.direction == INCOMING and channel not in WRITES[right]:

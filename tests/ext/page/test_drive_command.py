@@ -381,4 +381,4 @@ def test_a_request_for_control_that_is_not_answered_is_named() -> None:
     cab.robot.value["drive"] |= {"control": True}
     cab.receive(cab.robot.capabilities(), *(owner.state() for owner in cab.robot.owners), *KeepingRobot(GOOB).states())
     cab.run(6.0)
-    assert cab.driver.status().endswith(" · goob does not answer")
+    assert " · goob does not answer" in cab.driver.status()

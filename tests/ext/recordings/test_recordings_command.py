@@ -46,6 +46,7 @@ def test_list_and_info(folder: Path, run: Run) -> None:
     assert re.search(r"state +201 ", run.out)
     assert "1 file, 201 messages, " in run.out
     assert run("recordings", "info", folder) == 0
+    assert re.match(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d to 20", run.out)
     assert re.search(r"201 messages and 3 notes of the recorder, .* in 1 file\n", run.out)
     assert "pebble/robots/goob: 101 messages" in run.out
     assert "100  outgoing/online" in run.out
@@ -84,6 +85,8 @@ def test_an_import_in_another_order_is_read_in_that_of_time(tmp_path: Path, run:
 
 
 def test_one_robot_is_deleted(folder: Path, run: Run) -> None:
+    assert run("recordings", "rm", folder, "--robot", "fred", "--yes", "--until", "2000-01-01T00:00") == 0
+    assert run.out.startswith(f"{FRED} from the beginning to 2000-01-01 00:00:00 ")
     assert run("recordings", "rm", folder, "--robot", "fred", "--yes") == 0
     assert run.out == "100 messages deleted\n"
     assert messages(folder) == 101

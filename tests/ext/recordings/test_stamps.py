@@ -58,6 +58,7 @@ def test_what_is_no_stamp_is_0(payload):
 
 def test_a_stamp_of_a_board_counts_from_its_start():
     assert stamp_ns(b'{"t":1}') == 10**9
+    assert stamp_ns(b'{"t":100000000000}') == 10**17, "milliseconds from here on"
 
 
 @pytest.mark.parametrize(

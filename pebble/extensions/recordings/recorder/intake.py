@@ -41,9 +41,6 @@ class Intake:
         self._media = BoundedQueue[Item](_MOST_WAITING, limit - limit // 4)
         self._events: deque[Item] = deque(maxlen=_MOST_EVENTS)
 
-    def __len__(self) -> int:
-        return len(self._state) + len(self._media)
-
     def add(self, topic: str, payload: bytes, qos: int | None, retain: bool | None, retained: str, source: str) -> None:
         """Queue a message, described as in :class:`Item`; count those that are dropped for it."""
         item = Item(self._boot_ns(), topic, payload, qos, retain, retained, source)

@@ -102,10 +102,6 @@ class Recorder:
     def alive(self) -> bool:
         return self._thread.is_alive() and self._background.alive
 
-    @property
-    def waiting(self) -> int:
-        return len(self._intake)
-
     # -- the writer's thread
 
     def _write(self) -> None:

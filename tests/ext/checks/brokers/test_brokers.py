@@ -72,6 +72,17 @@ class HidesRetained(Fault):
         return super().down(first & ~RETAIN if kind(first) == PUBLISH else first, body)
 
 
+class RepeatsRetained(Fault):
+    """Sends what it retains a second time, after a newer message."""
+
+    again = b""
+
+    def down(self, first: int, body: bytes) -> list[bytes]:
+        sent, again = packet(first, body), self.again
+        self.again = sent if kind(first) == PUBLISH and first & RETAIN else b""
+        return [sent, b"" if self.again else again]
+
+
 class Doubles(Fault):
     def down(self, first: int, body: bytes) -> list[bytes]:
         return super().down(first, body) * (2 if kind(first) == PUBLISH else 1)
@@ -207,6 +218,7 @@ FAULTS = [
     (DropsWills, "will", "none is published"),
     further(LateWills, "will", "s after the connection is reset"),
     (HidesRetained, "rights", "without the retain flag"),
+    (RepeatsRetained, "newest last", "value"),
     (Doubles, "overlapping filters", "2 copies"),
     (Floods, "rights", "without end"),
     (FloodsWithAnswers, "rights", "without end"),

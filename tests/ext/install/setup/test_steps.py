@@ -29,8 +29,10 @@ RESTARTS = ["systemctl restart mosquitto.service", "systemctl restart pebble.ser
 
 def test_a_second_run_finds_all_as_it_should_be(root: Path, tmp_path: Path, run: Run) -> None:
     answers = answers_in(tmp_path)
+    (root / "usr/lib/polkit-1/polkitd").unlink()
     assert run("setup", "--answers", answers) == 1
     assert run.out.count("Failed: systemd does not run here, so nothing starts the robot") == 1
+    assert run.out.count("Note: polkit is not installed") == 1
     before = tree(root)
     assert run("setup", "--answers", answers) == 1
     assert "All is so already." in run.out
@@ -229,3 +231,4 @@ def test_in_folders_of_others_root_is_their_owner(
         assert (people.parent / "tls/ca.key").stat().st_uid == OWNERS[ROBOT][0]
         assert Places(other).people.stat().st_uid == OWNERS[ROBOT][0]
         assert {path.lstat().st_uid for path in Places(other).broker_folder.iterdir()} == {OWNERS[MOSQUITTO][0]}
+        assert {path.stat().st_gid for path in Places(here).etc.iterdir()} == {OWNERS[ROBOTS][1]}, "the robot reads it"

@@ -258,7 +258,7 @@ def test_whatever_ends_it_it_lets_go() -> None:
     )
     with pytest.raises(KeyboardInterrupt):
         operator.drive(z=0.5)
-    assert [drive["z"] for drive in given.drives] == [0.5, 0.5, 0.5, 0]
+    assert [(drive["x"], drive["z"]) for drive in given.drives] == [(0, 0.5)] * 3 + [(0, 0)]
 
 
 def test_it_drives_with_the_key_of_control_and_gives_it_back() -> None:

@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -83,8 +83,9 @@ def test_a_stop_reaches_a_living_address_behind_dead_ones(robot_on: Make, broker
 
 @pytest.mark.parametrize("id_", ["", "b\u00e4r", "ba\u0308r"])  # of two letters that look like one
 def test_a_stop_is_confirmed_by_every_owner(run: Run, robot_on: Make, url: str, id_: str) -> None:
-    robot = robot_on("left", "right", id_=id_)
+    robot, before = robot_on("left", "right", id_=id_), signal.getsignal(signal.SIGTERM)
     assert run("estop", "b\u00e4r" if id_ else robot.id, url, "--why", "dog") == 0
+    assert signal.getsignal(signal.SIGTERM) is before
     assert robot.latched
     assert run.out.splitlines()[-1].startswith(f"{robot.id}: stopped and confirmed after 0.")
     latch = robot.motors.owners[0].latch
@@ -572,6 +573,14 @@ def test_status_of_all(run: Run, robot_on: Make, url: str) -> None:
     assert lines[old.id] == "its firmware has none"
     assert lines[silent.id] == "unknown, no state of serial"
     assert lines[off.id] == "no heartbeat; its last state: free"
+
+
+def test_states_that_come_only_if_their_exact_topics_are_asked_for(run: Run, robot_on: Make, broker: Broker) -> None:
+    robot = robot_on("serial")
+    robot.start()
+    with closing(SparingBroker(broker.port, by_name=True)) as sparing:
+        assert run("estop", "status", robot.id, f"--url=mqtt://127.0.0.1:{sparing.port}") == 0
+    assert run.out == f"{robot.id}: free\n"
 
 
 # -- other commands

@@ -44,6 +44,7 @@ def at(request: pytest.FixtureRequest, local_transports: dict[str, str]) -> tupl
 def test_what_is_published_is_echoed_and_its_rate_measured_on_either_transport(
     at: tuple[str, str, str], run: Run
 ) -> None:
+    before = signal.getsignal(signal.SIGTERM)
     assert run("topic", "pub", "charging-level", '{"value": 7.4}', *at) == 0
     with running("topic", "pub", "drive-values", '{"x": 0.5}', "--rate", "40", *at) as pub:
         assert run("topic", "echo", "drive-values", "--count", "3", "--seconds", "60", *at) == 0, run.err
@@ -51,6 +52,7 @@ def test_what_is_published_is_echoed_and_its_rate_measured_on_either_transport(
         assert "incoming/drive-values  10 B  qos 1" in run.out
         assert run("topic", "hz", "drive-values", "--seconds", "1", *at) == 0
         assert " kbit/s  min " in run.out
+        assert signal.getsignal(signal.SIGTERM) is before
         assert run("topic", "hz", "charging-level", "--seconds", "0.5", *at) == 1, "what is retained does not count"
         assert set(run.out.splitlines()) == {"no new messages"}
         pub.send_signal(signal.SIGINT)
