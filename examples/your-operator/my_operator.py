@@ -30,6 +30,7 @@ KEEPALIVE_S = 5
 RETRY_S = 0.5
 REPEATS_S = 0.5
 GIVES_UP_S = 60.0
+MOST_TEXTS = 1000  # that wait to be printed
 
 
 class StopSender:
@@ -48,6 +49,31 @@ class StopSender:
             self.due_at = time.monotonic() + REPEATS_S
             for base in {PLAIN, INCOMING}:  # a stop counts without a name as well
                 client.publish(base + "estop", json.dumps(self.stop), qos=1)
+
+
+class Output:
+    """Standard output on a thread of its own: a terminal that stands still must delay no stop."""
+
+    def __init__(self):
+        self.texts = queue.SimpleQueue()
+        self.thread = threading.Thread(target=self.show, args=[sys.stdout], daemon=True)
+        self.thread.start()
+
+    def write(self, text):
+        if self.texts.qsize() < MOST_TEXTS:
+            self.texts.put(text)
+
+    def flush(self):
+        """Do nothing: the thread flushes."""
+
+    def show(self, stream):
+        for text in iter(self.texts.get, None):
+            stream.write(text)
+            stream.flush()
+
+    def close(self):
+        self.texts.put(None)
+        self.thread.join(1.0)
 
 
 def send(metric, value, qos):
@@ -76,6 +102,7 @@ def read_lines():
     lines.put(None)
 
 
+sys.stdout = Output()
 robot = RobotState()
 driver = Driver(robot, NAME, send)
 stop = None
@@ -118,3 +145,4 @@ driver.push(0.0, 0.0)
 driver.release()
 for _ in range(30):
     client.loop(STEP_S)
+sys.stdout.close()

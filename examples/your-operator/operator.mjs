@@ -20,6 +20,7 @@ const STEP_MS = 10;
 const REPEATS_MS = 500;
 const GIVES_UP_MS = 60_000;
 
+process.stdout._handle?.setBlocking?.(false); // a terminal that stands still must delay no stop
 const robot = new RobotState();
 const driver = new Driver(robot, NAME, send);
 let stop = null; // an emergency stop that is not confirmed yet
