@@ -38,8 +38,8 @@ def remove_left_states(config: Config, names: Iterable[str]) -> None:
         command = [sys.executable, "-Pm", __name__, str(config.path)]  # -P: imports nothing from the current folder
         try:
             subprocess.run(command, stdin=subprocess.DEVNULL, timeout=_LIMIT_S, check=True)
-        except (OSError, subprocess.SubprocessError):
-            log.warning("they stay there until the next start: the broker does not answer")
+        except (OSError, subprocess.SubprocessError) as error:
+            log.warning("states of programs that it no longer has stay at its broker: %s", error)
             return
     if before != now:
         with suppress(PebbleError, OSError):
