@@ -35,7 +35,7 @@ def remove_left_states(config: Config, names: Iterable[str]) -> None:
         import subprocess  # few starts need it
 
         log.info("removing the states at the robot's broker: it no longer has %s", ", ".join(gone))
-        command = [sys.executable, "-Pm", __name__, str(config.path)]  # -P: imports nothing from the current folder
+        command = [sys.executable, "-m", __name__, str(config.path)]
         try:
             subprocess.run(command, stdin=subprocess.DEVNULL, timeout=_LIMIT_S, check=True)
         except (OSError, subprocess.SubprocessError) as error:
