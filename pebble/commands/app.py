@@ -157,7 +157,9 @@ def _run(arguments: list[str]) -> int:
             return 0
         from pebble.config.secret_text import without_secrets  # of use to errors only
 
-        wrong = without_secrets(message).replace("float range", "number").replace("int range", "whole number")
+        # A mistyped option's name is no secret, but is hidden if it looks like one before its suggestions.
+        wrong = message if message.startswith("No such option") else without_secrets(message)
+        wrong = wrong.replace("float range", "number").replace("int range", "whole number")
         file = message.rpartition("(")[2].rstrip(")")  # of an argument too many
         options = () if context is None else context.command.params
         if file.endswith(".json") and Path(file).is_file() and any("-c" in option.opts for option in options):

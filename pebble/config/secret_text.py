@@ -7,7 +7,9 @@ _NAMES = "pass|secret|token|credential|(?:api|access|private|auth).?key"
 _KEY = re.compile(_NAMES, re.IGNORECASE).search
 _NAME = rf"[\w-]{{0,40}}(?:{_NAMES}|pwd)[\w-]{{0,40}}"
 _END = r"(?<![_-]file)(?<![_-]env)"  # of a name; what is in a file or a variable stays there
-_VALUE = r"""(?:(?<=")[^"\n]+|(?<=')[^'\n]+|(?<!["'])[^&\s]+)"""  # in quotes it may have blanks
+_REST = r"""(?=["'\w\\])[^&\s]*"""  # a shell goes on with the same word after a closing quote
+#: In quotes it may have blanks.
+_VALUE = rf"""(?:(?<=")[^"\n]+(?:"{_REST})?|(?<=')[^'\n]+(?:'{_REST})?|(?<!["'])[^&\s]+)"""
 _NEXT = r"""(?:["'],\s*|[= \t][ \t]*)\\?["']?"""  # from an option to its value, on a command line or in a list
 #: A pair of a query, an option or a variable.
 _PAIR = re.compile(rf"""(\b(?:{_NAME}|[\w-]{{0,40}}\bsig(?:nature)?)=\\?["']?){_VALUE}""", re.IGNORECASE)
@@ -15,7 +17,7 @@ _PAIR = re.compile(rf"""(\b(?:{_NAME}|[\w-]{{0,40}}\bsig(?:nature)?)=\\?["']?){_
 _OPTION = re.compile(
     rf"""((?<![\w-])(?!--no-)--?(?i:{_NAME}){_END}{_NEXT}(?!-)"""
     rf"""|(?<![\w-])(?:-u|--(?:proxy-)?user)(?:{_NEXT})?(?!\d+:\d+\b)[^\s:"'/=]{{1,64}}:(?!//)"""
-    rf"""|\bmosquitto_[^\n]{{1,400}}?[\s"']-P{_NEXT}"""
+    rf"""|\bmosquitto_[^\n]{{1,400}}?[\s"']-P(?:{_NEXT})?"""
     rf"""|\b(?:sshpass|mysql|docker login)\b[^\n]{{0,400}}?[\s"']-p(?:{_NEXT})?){_VALUE}"""
 )
 _HEADER = re.compile(

@@ -78,10 +78,6 @@ class Launcher:
             self._signals.install()
             for place in filter(None, (extension.prepare for extension in config.installed)):
                 part(place)(config)
-            if config.transport.kind == "mqtt":
-                from pebble.launcher.left_states import remove_left_states  # few robots need it
-
-                remove_left_states(config, [supervisor.program.name for supervisor in self._supervisors])
             try:
                 self._reactor.every(_RUN_DIR_S, lambda: self._keep(lock))
                 self._start()

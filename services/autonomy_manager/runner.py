@@ -216,8 +216,9 @@ class Runner:
         part.ended = True
         if run is not self._run:  # of a run that was closed
             return
-        signal_ = code - _BY_SIGNAL if code > _BY_SIGNAL else -code  # that of a script, and that of the system
-        how = f"exited with code {code}" if 0 <= code <= _BY_SIGNAL else f"was ended by signal {signal_}"
+        by_signal = _BY_SIGNAL < code < _BY_SIGNAL + signal.NSIG  # as a script says it; the system: below 0
+        signal_ = code - _BY_SIGNAL if by_signal else -code
+        how = f"was ended by signal {signal_}" if by_signal or code < 0 else f"exited with code {code}"
         log.info("%s %s", part.file, how)
         if part is run.main:
             self._service.halt_repeatedly(run.number)

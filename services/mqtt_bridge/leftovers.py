@@ -26,7 +26,11 @@ class Leftovers:
         self._on_robot: set[str] | None = set()  # topics that the robot retains; None: the search is over
         self._at_remote: set[str] = set()  # topics that the broker retains
         self._subscriptions: list[Subscription] = []
-        self._filters = state_filters(base, subjects, *channels)
+        states = [channel for channel in CHANNELS if channel.kind is Kind.STATE and channel.direction == OUTGOING]
+        wanted = [state for state in states if state not in (*_EXCEPTED, *channels) and state.synonym_of is None]
+        patterns = [state.filter(base) for state in wanted if state.is_pattern]
+        named = subjects.topics(*(state for state in wanted if not state.is_pattern))
+        self._filters = [MCU_VALUE.filter(base), *patterns, *named]  # MCU_VALUE: a manifest may retain it
         self._next = 0  # the index of the filter to ask for next
 
     @property
@@ -80,12 +84,3 @@ class Leftovers:
     def _note_remote(self, message: Message) -> None:
         if message.retain and message.payload and len(self._at_remote) <= _TOPICS:
             self._at_remote.add(message.topic)
-
-
-def state_filters(base: str, subjects: Subjects, *but: Channel) -> list[str]:
-    """Return the filters of the topics that the robot's programs may retain, except heartbeats and ``but``."""
-    states = [channel for channel in CHANNELS if channel.kind is Kind.STATE and channel.direction == OUTGOING]
-    wanted = [state for state in states if state not in (*_EXCEPTED, *but) and state.synonym_of is None]
-    patterns = [state.filter(base) for state in wanted if state.is_pattern]
-    named = subjects.topics(*(state for state in wanted if not state.is_pattern))
-    return [MCU_VALUE.filter(base), *patterns, *named]  # MCU_VALUE: a manifest may retain it

@@ -57,6 +57,7 @@ def test_a_command_imports_no_other() -> None:
     [
         (("flyy",), "flyy", "pebble --help"),
         (("mqtt://me:sentinel@a",), "mqtt://***@a", "pebble --help"),
+        (("estop", "--password", "x"), "--password (Possible options: --password-file)", "pebble estop --help"),
         (("up",), "CONFIG", "pebble up --help"),
         (("sim", "bob"), "bob", "pebble sim --help"),
         (("sim", "minilamp"), "--broker URL", "pebble sim --help"),

@@ -149,6 +149,14 @@ def test_a_secret_on_a_command_line_is_not_printed_again(run: Run) -> None:
         (f'MQTT_PASSWORD="{SECRET} {SECRET}" x', 'MQTT_PASSWORD="***" x'),
         (f"sshpass -p {SECRET} x; mysql -u root -p{SECRET} x", "sshpass -p *** x; mysql -u root -p*** x"),
         (f"mosquitto_pub -p 1883 -P {SECRET} -t x", "mosquitto_pub -p 1883 -P *** -t x"),
+        (f"mosquitto_pub -P{SECRET} -t x", "mosquitto_pub -P*** -t x"),
+        (f'password="a\\"b{SECRET}"; token="a""{SECRET}"', 'password="*** token="***'),
+        (f"""password='it'"'"'s{SECRET}' MYSQL_PWD='ab'{SECRET} x""", "password='*** MYSQL_PWD='*** x"),
+        (f'?token="aaa"{SECRET}&x=1', '?token="***&x=1'),
+        (
+            f"""f(password='{SECRET}', y='z'), password="{SECRET}",user="y\"""",
+            """f(password='***', y='z'), password="***",user="y\"""",
+        ),
         (f'["mosquitto_sub", "-P", "{SECRET}"]', '["mosquitto_sub", "-P", "***"]'),
         *[
             (text, text)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
@@ -16,14 +15,12 @@ from typing import Any
 
 import pytest
 
-from pebble.config import Config, load, parse
-from pebble.launcher.left_states import remove_left_states
+from pebble.config import Config, parse
 from pebble.launcher.programs import programs, shared_modules
 from pebble.launcher.run_lock import RunLock
-from pebble.transports import MqttSettings, QoS, create
 from tests.fakes.seccomp import CALLS
 from tests.launcher.conftest import BASE, CONNECTION, DEVICE, LOCAL_TRANSPORT, Launch, lines_of
-from tests.support import ROOT, WAIT_S, Broker, free_port, gone, until
+from tests.support import ROOT, WAIT_S, gone, until
 
 
 def test_children_start_in_order_and_stop_one_stage_after_the_other_and_nothing_is_left(launch: Launch) -> None:
@@ -311,37 +308,6 @@ def test_a_robot_has_the_programs_of_its_config(
     services: dict[str, Any], transport: dict[str, Any], names: str
 ) -> None:
     assert ["+" * one.on_demand + one.name for one in programs(_parsed(services, transport))] == names.split()
-
-
-def test_the_states_of_a_program_that_the_robot_no_longer_has_are_removed_at_its_broker(
-    tmp_path: Path, broker: Broker, caplog: pytest.LogCaptureFixture
-) -> None:
-    """A start that finds no broker leaves them to the next one."""
-    transport = {"kind": "mqtt", "state_dir": str(tmp_path / "state")}
-    metrics = ("outgoing/autonomy-status", "outgoing/mcu/m1/range", "outgoing/online", "outgoing/x", "incoming/flags/x")
-
-    def start(*names: str, port: int = broker.port) -> list[str]:
-        (tmp_path / "rover.json").write_text(
-            json.dumps({"robot": {"id": "rover"}, "transport": transport, "local_mqtt": {"port": port}})
-        )
-        remove_left_states(load(tmp_path / "rover.json"), names)
-        seen = set[str]()
-        with create("mqtt", "looker", MqttSettings(host="127.0.0.1", port=broker.port)) as looker:
-            looker.subscribe(f"{BASE}/#", lambda message: seen.add(message.topic.removeprefix(f"{BASE}/")))
-            looker.publish(f"{BASE}/end", b"", qos=QoS.DELIVERED)  # it comes after what is retained
-            assert until(lambda: "end" in seen)
-        return [metric for metric in metrics if metric in seen]
-
-    with create("mqtt", "robot", MqttSettings(host="127.0.0.1", port=broker.port)) as robot:
-        for metric in metrics:
-            robot.publish(f"{BASE}/{metric}", b"1", qos=QoS.DELIVERED, retain=True)
-        assert start("a", "b") == [*metrics]
-        assert start("a", "b", "c") == [*metrics]
-        assert start("a", "b", port=free_port()) == [*metrics]
-        assert caplog.messages[-1] == "they stay there until the next start: the broker does not answer"
-        assert start("a", "b") == [*metrics[2:]]
-        robot.publish(f"{BASE}/{metrics[0]}", b"1", qos=QoS.DELIVERED, retain=True)
-        assert start("b", "a") == [metrics[0], *metrics[2:]]
 
 
 #: Of a robot with a camera, a text protocol on its serial line, and the security level `open`.

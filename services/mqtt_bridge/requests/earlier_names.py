@@ -74,8 +74,8 @@ def _stop_files(config: Config, base: str) -> list[Path]:
             return []
         raise PebbleError(f"{folder}: {error.strerror}: stops of {base} may be there, let its user read it") from None
     # The names of several robots may end alike. The lock of its launcher, which each has here, tells its whole name.
-    ends = [f"{lock.stem.removeprefix('launcher')}.json" for lock in files if lock.match("launcher-*.lock")]
-    others = tuple(other for other in ends if other.endswith(end) and other != end)
+    ends = {f"{lock.stem.removeprefix('launcher')}.json" for lock in files if lock.match("launcher-*.lock")}
+    others = tuple(other for other in ends - {end, f"-{file_name(config.base)}.json"} if other.endswith(end))
     ours = (file for file in files if file.name.endswith(end) and not file.name.endswith(others))
     return [file for file in ours if file.name.startswith("estop-")]
 

@@ -378,6 +378,22 @@ def test_a_stop_of_a_robot_whose_name_ends_alike_stays(tmp_path: Path, file: str
     assert [path.name for path in tmp_path.glob("estop-*")] == [f"estop-{left}pebble+robots+goob.json"]
 
 
+def test_a_stop_follows_a_robot_whose_new_name_ends_like_the_file_of_the_old_one(tmp_path: Path) -> None:
+    path, line = tmp_path / "robot.json", {"enabled": True, "serial": {"port": "/dev/null"}}
+    files = []
+    for system in ("pebble", "x-pebble"):
+        robot, transport = {"system": system, "id": "goob"}, {"kind": "zenoh", "state_dir": str(tmp_path)}
+        services = {"serial_mcu_bridge": {"instances": {"x": line}}}
+        path.write_text(json.dumps({"robot": robot, "transport": transport, "services": services}))
+        config = load(path)
+        (tmp_path / f"launcher-{system}+robots+goob.lock").touch()
+        files.append(config.state_file(f"estop-{config.motor_owners[0]}"))
+        if system == "pebble":
+            files[0].write_text(STOPPED)
+        keep_stops(config)
+    assert [file.exists() for file in files] == [False, True]
+
+
 def test_what_another_robot_retains_stays(robot: Named) -> None:
     robot.start("rover")
     robot.leave()
