@@ -63,11 +63,12 @@ def or_undone(undone: str) -> Iterator[None]:
 class PrintingThread:
     """A thread that prints in turn, so that a terminal that stands still holds up nothing else.
 
-    Of more than _MOST prints that wait, the newest are dropped.
+    Of more than _MOST prints that wait, the newest are dropped; a line then says how many.
     """
 
     def __init__(self) -> None:
         self._prints = queue.SimpleQueue[Callable[[], object] | None]()
+        self._dropped = 0  # and not said
         self._thread = threading.Thread(target=self._work, name="pebble-print", daemon=True)
         self._thread.start()
 
@@ -75,6 +76,8 @@ class PrintingThread:
         """Call ``prints`` after all earlier ones."""
         if self._prints.qsize() < _MOST:
             self._prints.put(prints)
+        else:
+            self._dropped += 1
 
     def close(self, wait_s: float | None = None) -> None:
         """End when all is printed; wait for that, if ``wait_s`` is given at most so long."""
@@ -87,6 +90,9 @@ class PrintingThread:
                 prints()
             except Exception:  # such as a character that the terminal does not have
                 log.exception("a line cannot be printed")
+            if self._dropped and self._prints.qsize() <= 1:  # at most the end of all
+                dropped, self._dropped = self._dropped, 0
+                say(f"lines that were not printed, as too many waited: {dropped}")
 
 
 @contextmanager
