@@ -26,7 +26,7 @@ from typing import Any, NamedTuple, cast
 import pytest
 
 Indexes = list[int]  # of items, in the order in which they are collected
-ALONE, IDLE = 5, 2  # processes: these tests check deadlines; those of the background
+ALONE, IDLE = 4, 2  # processes: these tests check deadlines; those of the background
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
