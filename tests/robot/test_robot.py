@@ -101,6 +101,7 @@ def test_a_stop_that_comes_once_while_the_motor_owner_restarts_holds_without_a_b
     with Rig("single", start=False, mqtt_bridge={"enabled": False}) as rig:
         rig.start(ready=False)
         assert until(lambda: rig.operator.newest("estop/serial").get("latched") is False)
+        rig.operator.wait_for("outgoing/status")  # of the process that repeats stops, sent after its subscriptions
         rig.kill("serial_mcu_bridge")
         rig.operator.send("incoming/estop", {"by": "ann"})
         assert until(lambda: rig.operator.newest("estop/serial")["by"] == "ann")
