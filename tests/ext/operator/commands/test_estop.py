@@ -174,7 +174,8 @@ def test_a_robot_that_does_not_answer_is_reported_and_ctrl_c_ends_it(robot_on: M
         out, err = process.communicate(timeout=WAIT_S)
     assert out.startswith(f"{robot.id}: NOT CONFIRMED, no longer sent: serial has not confirmed")
     assert (process.returncode, err) == (1, "")
-    assert robot.count("estop") == robot.count("drive-values") >= 2
+    assert robot.count("drive-values") >= 2
+    assert robot.count("estop") - robot.count("drive-values") in (0, 1)  # Ctrl-C may come between the two
 
 
 def test_the_robots_that_are_heard_are_named_where_the_one_that_is_meant_is_not(
