@@ -243,7 +243,7 @@ result = given.map((hex) => {
 
 
 def unpacked(raw: bytes) -> list[int] | None:
-    """What pebble.extensions.media.sound finds in a packet; None: it cannot be played."""
+    """Return what pebble.extensions.media.sound finds in a packet; None: it cannot be played."""
     try:
         one = unpack(raw)
     except PayloadError:
