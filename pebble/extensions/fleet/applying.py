@@ -1,4 +1,7 @@
-"""Applies changes of a fleet: writes the files of brokers and hubs from its table, and makes mosquitto reload them."""
+"""Applies changes of a fleet: writes the files of brokers and hubs from its table, and makes mosquitto reload them.
+
+Also finds what differs between table and files, and certificates that expire soon.
+"""
 
 import os
 import signal
@@ -16,6 +19,7 @@ from pebble.runtime.whole_file import is_root, set_mode, write
 _LOOPBACK = "127.0.0.1"
 _PLUGIN = "dynamic_security"  # in the name of its library
 _STARTING_S = 3.0  # a small board loads many accounts
+_SOON_DAYS = 30  # before a certificate ends
 
 
 def make(folder: Path, fleet: Fleet, passwords: Mapping[str, str] | None = None, others: Sequence[str] = ()) -> None:
@@ -97,7 +101,7 @@ def write_zenoh(folder: Path, fleet: Fleet) -> None:
     write(folder / ZENOH, zenoh_text(fleet), 0o644, FleetError)
 
 
-def zenoh_differences(folder: Path, fleet: Fleet) -> Iterator[str]:
+def _zenoh_differences(folder: Path, fleet: Fleet) -> Iterator[str]:
     """Yield a line if the rules for Zenoh hubs differ from the table."""
     from pebble.extensions.fleet.zenoh_rules import zenoh_text
 
@@ -190,3 +194,44 @@ def _handles_signal(pid: int) -> bool:
             return True
         time.sleep(0.01)
     return False
+
+
+# -- what differs
+
+
+def by_hand(folder: Path, fleet: Fleet) -> list[str]:
+    """Return the differences that no command removes, each with what to do. Raises FleetError."""
+    return [*conf_differences(folder, fleet), *_certificates(folder, fleet)]
+
+
+def of_rules(folder: Path, fleet: Fleet) -> list[str]:
+    """Return the differences of accounts and rules, which `pebble fleet apply` removes. Raises FleetError."""
+    return [*_zenoh_differences(folder, fleet), *_of_acl(folder, fleet), *_of_passwords(folder, fleet)]
+
+
+def _certificates(folder: Path, fleet: Fleet) -> Iterator[str]:
+    renewals = {folder / certificates.SERVER_CERT: f"`pebble cert renew --folder {folder}`, then restart mosquitto"}
+    for name in fleet.accounts:
+        file = folder / certificates.ACCOUNTS / f"{name}.pem"
+        if file.exists():
+            renewals[file] = f"`pebble fleet certificate {name}`, with its hosts, and move it to its machine"
+    for file, how in renewals.items():
+        days = certificates.show(file).days_left
+        if days < _SOON_DAYS:
+            yield f"{file} ends in {days:.0f} days: {how}"
+
+
+def _of_acl(folder: Path, fleet: Fleet) -> Iterator[str]:
+    try:
+        present_rules = dict.fromkeys(broker_files.rules_in(read_plain(folder / ACL).decode()))
+    except OSError as error:
+        raise FleetError(f"{error.filename}: {error.strerror}") from None
+    wanted = dict.fromkeys(broker_files.rules_in(broker_files.acl_text(fleet)))
+    yield from (f"one rule too many: {rule}" for rule in present_rules if rule not in wanted)
+    yield from (f"one rule too few: {rule}" for rule in wanted if rule not in present_rules)
+
+
+def _of_passwords(folder: Path, fleet: Fleet) -> Iterator[str]:
+    stored = passwords_of(folder)
+    yield from (f"{name}: an account too many: the broker lets it in" for name in stored.keys() - fleet.accounts)
+    yield from (f"{name}: has no password: `pebble fleet password {name}`" for name in fleet.accounts - stored.keys())

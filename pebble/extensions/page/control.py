@@ -15,7 +15,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 from pebble.extensions.fleet.database import DatabaseError
 from pebble.extensions.fleet.roles import Session, page_rights
 from pebble.extensions.operator.client.drive_reasons import WORDS, person
-from pebble.extensions.operator.client.estop_states import Reset
+from pebble.extensions.operator.client.robot_estop import Reset
 from pebble.extensions.page import messages as m
 from pebble.extensions.page import robot_commands
 from pebble.extensions.page.access.login import address_of, named, printable

@@ -25,7 +25,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives.hashes import SHA256
 from msgspec.structs import replace
 
-from pebble.extensions.fleet import authority, broker_files, check
+from pebble.extensions.fleet import applying, authority, broker_files
 from pebble.extensions.fleet.certificates import CertificateError, init, renew, show
 from pebble.extensions.fleet.folder import ACL, CONF, FLEET, PASSWORDS, ZENOH, Extra, FleetError, load, locked, refused
 from pebble.extensions.fleet.hub_access import read_access
@@ -119,7 +119,7 @@ def test_a_change_while_mosquitto_is_down_counts_when_it_runs(broker: FleetBroke
     assert "mosquitto does not run" in broker.add("zoe", DRIVER)
     broker.remove("otto")
     broker.start()
-    assert check.of_rules(broker.folder, broker.fleet) == []
+    assert applying.of_rules(broker.folder, broker.fleet) == []
     assert [_gets_in(broker, name) for name in ("zoe", "otto", "goob")] == [True, False, True]
 
 
@@ -153,11 +153,11 @@ def test_a_password_survives_a_change_of_level(broker: FleetBroker) -> None:
 def test_it_finds_one_rule_too_many_and_one_too_few(tmp_path: Path) -> None:
     broker = FleetBroker(tmp_path / "hall", {"otto": DRIVER, "goob": GOOB})
     fleet = broker.fleet
-    assert check.of_rules(broker.folder, fleet) == []
-    found = check.of_rules(broker.folder, replace(fleet, accounts=fleet.accounts | {"otto": VIEWER, "new": VIEWER}))
+    assert applying.of_rules(broker.folder, fleet) == []
+    found = applying.of_rules(broker.folder, replace(fleet, accounts=fleet.accounts | {"otto": VIEWER, "new": VIEWER}))
     assert "one rule too many: otto: write +/+/+/incoming/drive-values" in found
     assert "new: has no password: `pebble fleet password new`" in found
-    found = check.of_rules(broker.folder, replace(fleet, extra=Extra(look=("arm/+",))).without("goob"))
+    found = applying.of_rules(broker.folder, replace(fleet, extra=Extra(look=("arm/+",))).without("goob"))
     assert "one rule too few: otto: write +/+/+/incoming/arm/+" in found
     assert "goob: an account too many: the broker lets it in" in found
 
@@ -176,7 +176,7 @@ def test_it_finds_changes_of_files(tmp_path: Path, file: str, old: str, new: str
     broker = FleetBroker(tmp_path / "hall", {"otto": DRIVER, "goob": GOOB})
     changed = (broker.folder / file).read_text().replace(old, new)
     (broker.folder / file).write_text(changed)
-    by_hand, rules = check.by_hand(broker.folder, broker.fleet), check.of_rules(broker.folder, broker.fleet)
+    by_hand, rules = applying.by_hand(broker.folder, broker.fleet), applying.of_rules(broker.folder, broker.fleet)
     assert any(found in line for line in (*by_hand, *rules))
     assert bool(by_hand) == (file == CONF), "`pebble fleet apply` is advised for what it mends"
     assert all(line.endswith("then restart mosquitto") for line in by_hand)
@@ -311,7 +311,7 @@ def test_commands_change_a_folder_one_after_the_other(tmp_path: Path) -> None:
             broker.add(f"b{number}", DRIVER)
     assert os.waitpid(child, 0)[1] == 0
     assert len(broker.fleet.accounts) == 20
-    assert check.of_rules(broker.folder, broker.fleet) == []
+    assert applying.of_rules(broker.folder, broker.fleet) == []
 
 
 def test_a_command_that_waits_for_another_one_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

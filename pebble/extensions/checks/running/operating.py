@@ -13,9 +13,9 @@ from pebble.extensions.checks.conform.motion import LATE_S, at_the_wheel, rested
 from pebble.extensions.checks.running.robot import RobotUnderTest
 from pebble.extensions.operator.client.driveable import doubt_of, is_cut_off
 from pebble.extensions.operator.client.estop import StopSender, new_name, send
-from pebble.extensions.operator.client.estop_states import Reset
 from pebble.extensions.operator.client.media_receiver import MediaReceiver
 from pebble.extensions.operator.client.media_request.offer import Medium
+from pebble.extensions.operator.client.robot_estop import Reset
 from pebble.transports import QoS
 
 _LOG = "pebble doctor CONFIG; journalctl -u pebble -n 50"

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from pebble.config.visible import shown
 from pebble.errors import PebbleError
-from pebble.extensions.fleet import applying, certificates, check, folder, pieces, plugin
+from pebble.extensions.fleet import applying, certificates, folder, pieces, plugin
 from pebble.extensions.fleet.broker_files import new_password
 from pebble.extensions.fleet.commands import lan
 from pebble.extensions.fleet.commands.lan import LAZY_MODULES
@@ -297,7 +297,7 @@ def check_(folder_: _Folder = None) -> int:
     """
     require_packages("pebble fleet")
     with _locked_fleet(folder_) as (place, fleet):
-        by_hand, rules = check.by_hand(place, fleet), check.of_rules(place, fleet)  # `apply` mends only the rules
+        by_hand, rules = applying.by_hand(place, fleet), applying.of_rules(place, fleet)  # `apply` mends only the rules
     code = _print_left(by_hand + rules)
     if rules:
         typer.echo(f"pebble: `pebble fleet apply --folder {_shown(place)}` writes the rules again", err=True)

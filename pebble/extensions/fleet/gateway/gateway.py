@@ -10,6 +10,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 
 import msgspec
 
@@ -19,17 +20,18 @@ from pebble.contract.names import with_name
 from pebble.contract.payloads import GatewayHeartbeat
 from pebble.errors import PebbleError
 from pebble.extensions.fleet.gateway.carried_robot import Beginning, CarriedRobot, begin
-from pebble.extensions.fleet.gateway.others import FRESH_S, HEARTBEAT_S, OtherGateways
 from pebble.forwarding.cycles import Cycles, Finding
 from pebble.forwarding.routing import Side
 from pebble.forwarding.subjects import Subject
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.transports import Message, QoS, State, Transport
-from pebble.transports.counters import Counters
 
 log = logging.getLogger(__name__)
 
 TICK_S = 0.1
+HEARTBEAT_S = 0.5
+FRESH_S = 1.25  # so long a heartbeat of another gateway counts; and so long a gateway listens before it begins
+MAX_GATEWAYS = 16  # that are known beside this one
 MAX_ROBOTS = 1000  # that one gateway carries; further ones with a warning
 SILENT_S = 30.0  # without a heartbeat a robot is carried so long: three periods of the slowest heartbeats
 #: Robots that begin in one turn: they wait together for hub and broker. What moves is taken for old while a turn lasts
@@ -55,6 +57,51 @@ def is_stop(topic: str) -> bool:
     return f"/{ESTOP.direction}/" in topic and topic.endswith(_STOP_END)
 
 
+@dataclass(frozen=True, slots=True)
+class _Other:
+    heard_at: float
+    run: str
+    robots: frozenset[str]
+
+
+class OtherGateways:
+    """The newest heartbeat of each other gateway at the same broker, so that no robot is carried twice.
+
+    ``run`` identifies this gateway: if two carry the same robot, the greater ``run`` continues. Two that begin at the
+    same moment both carry it until they hear each other.
+    """
+
+    def __init__(self, run: str) -> None:
+        self.run = run
+        self._others: dict[str, _Other] = {}
+
+    def forget(self) -> None:
+        """Forget all gateways, because the connection on which they were heard is lost."""
+        self._others.clear()
+
+    def left(self, name: str) -> None:
+        """Note that a gateway is gone: it left in order, or its will was published."""
+        self._others.pop(name, None)
+
+    def heard(self, name: str, run: str, robots: tuple[str, ...], now: float) -> None:
+        """Note a live heartbeat of any gateway."""
+        if run == self.run:
+            return
+        others = self._others.copy()  # another thread may change the table
+        if name not in others and len(others) >= MAX_GATEWAYS:
+            oldest = min(others, key=lambda other: others[other].heard_at)
+            self._others.pop(oldest, None)
+        self._others[name] = _Other(now, run, frozenset(robots))
+
+    def carrier(self, robot: str, now: float, *, carried: bool) -> str:
+        """Return the other gateway that carries ``robot``; empty if none does. ``carried``: this one carries it too."""
+        for name, other in list(self._others.items()):
+            is_carrier = now - other.heard_at <= FRESH_S and robot in other.robots
+            if is_carrier and (not carried or other.run > self.run):
+                return name
+        return ""
+
+
 class Gateway:
     """A forwarder for all robots whose base topics match ``robots``. Its transports are not yet open.
 
@@ -72,7 +119,6 @@ class Gateway:
         stops: Transport,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.counters = Counters()
         self._name, self._filters, self._clock = name, tuple(robots), clock
         self._hub, self._broker, self._presence, self._stops = hub, broker, presence, stops
         self._others = OtherGateways(secrets.token_hex(4))
@@ -262,11 +308,9 @@ class Gateway:
 
     def _on_stop(self, stop: Message) -> None:
         if not stop.retain and self._stop_cycles.examine(Side.REMOTE, _STOP, stop) is Finding.PASS:
-            self.counters.add("stops")
             self._hub.publish(stop.topic, stop.payload, qos=QoS.DELIVERED, urgent=True)
 
     def _report_large(self, topic: str) -> None:
-        self.counters.add("too_large")
         self._quiet_log.warning("large", "a message on %s is larger than a gateway passes", topic[:200])
 
     def _stops_pass(self) -> bool:

@@ -1,9 +1,12 @@
-"""The file of ``pebble fleet gateway``: the robots' hub, the operators' MQTT broker, and which robots to carry."""
+"""The file of ``pebble fleet gateway``: the robots' hub, the operators' MQTT broker, which robots to carry; and the
+connections that it asks for.
+"""
 
 import os
 from pathlib import Path
 from typing import Annotated
 
+from pebble import contract as c
 from pebble.config.config import default_run_folder
 from pebble.config.problems import Notes
 from pebble.config.raw import decode, plain, read_text
@@ -14,7 +17,15 @@ from pebble.config.transport import Mqtt, ZenohSection
 from pebble.config.types import EMPTY, Account, Level, Section, doc
 from pebble.contract.identity import GATEWAYS, SERVERS, Identity
 from pebble.errors import ConfigError
+from pebble.runtime.connections import (
+    LOCAL_RECONNECT_S,
+    REMOTE_RECONNECT_S,
+    client_of_hub,
+    live_only,
+    mqtt_settings,
+)
 from pebble.services.neighbours.config import RULES, Neighbours
+from pebble.transports import Message, Transport, create
 
 MOST_BOARDS = 16  # of one file that have neighbours: each has two connections and a thread
 
@@ -115,3 +126,29 @@ def _is_base(base: str) -> bool:
     except (ConfigError, TypeError):
         return False
     return base.split("/")[1] not in (SERVERS, GATEWAYS)
+
+
+def gateway_transports(
+    gateway: GatewayFile, operators: Mqtt, run_dir: Path, will: Message
+) -> tuple[Transport, Transport, Transport, Transport]:
+    """Return a gateway's connections: one to the robots' hub, three to the operators' broker.
+
+    Of the three, one is for its heartbeats with its will, and one for stops.
+    """
+    base = will.topic.removesuffix(f"/{c.ONLINE.suffix}")
+    forwards = mqtt_settings(operators, as_published=True, reconnect_max_s=REMOTE_RECONNECT_S)
+    apart = mqtt_settings(operators, reconnect_max_s=REMOTE_RECONNECT_S)
+    return (
+        _robots_transport(gateway, base, run_dir),
+        create("mqtt", f"{base}/forwards", forwards),
+        create("mqtt", f"{base}/presence", apart, will=will),
+        create("mqtt", f"{base}/stops", live_only(apart)),
+    )
+
+
+def _robots_transport(gateway: GatewayFile, base: str, run_dir: Path) -> Transport:
+    if gateway.boards is not None:
+        settings = mqtt_settings(gateway.boards, as_published=True, reconnect_max_s=LOCAL_RECONNECT_S)
+        return create("mqtt", f"{base}/boards", settings)
+    hub = gateway.hub
+    return create("zenoh", f"{base}-hub", client_of_hub(run_dir, hub, hub.lease_ms, hub.account))

@@ -14,7 +14,7 @@ from pebble.contract import DRIVE, codec
 from pebble.contract.payloads import Drive
 from pebble.extensions.operator.client.control import ControlClient
 from pebble.extensions.operator.client.estop import StopSender, new_name
-from pebble.extensions.operator.client.estop_states import Reset
+from pebble.extensions.operator.client.robot_estop import Reset
 from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.transports import Message, QoS
 

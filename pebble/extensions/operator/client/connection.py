@@ -19,8 +19,7 @@ from pebble.errors import ConfigError, PebbleError, TransportError
 from pebble.extensions.operator.client.named_topics import NamedTopics
 from pebble.extensions.operator.client.names import ANY_ROBOT, Names, base_of, spellings
 from pebble.extensions.operator.client.robot_estop import RobotEstop
-from pebble.extensions.operator.client.url import password as password
-from pebble.extensions.operator.client.url import settings_of
+from pebble.extensions.operator.client.url import password, settings_of
 from pebble.extensions.operator.notices import PATIENCE_S, noticed
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.connections import REMOTE_RECONNECT_S, local_settings, mqtt_settings, zenoh_settings

@@ -90,7 +90,6 @@ class ControlClient:
         self.wanted = self.held = False
         self.decided = ""  # the deciding owner's key while control is held: with another key a new gesture is needed
         self.failed = ""
-        self.passed_over = ""  # the id of a client whose request was declined here
         self._by, self._device, self._pace_of = by, device, pace_of
         self._take = False  # the next request takes control from its holder
         # When this client began to ask, when the robot last showed that it deals with requests, when the next is due.
@@ -113,11 +112,6 @@ class ControlClient:
             self._out.append(self._message(CONTROL, want="release"))
         self.wanted = self.held = False
         self.decided = ""
-
-    def keep(self) -> None:
-        """Keep control although another client asks for it now."""
-        state = self.robot.state
-        self.passed_over = state.asks_id if state is not None else ""
 
     # -- what follows
 
@@ -170,12 +164,9 @@ class ControlClient:
 
     @property
     def asked_by(self) -> str:
-        """Return the name of a client that asks for control; "" if none does.
-
-        Also "" if it was refused, or if this client has no control.
-        """
+        """Return the name of a client that asks this one for control; "" if none does."""
         state = self.robot.state
-        if not self.held or state is None or state.asks_id in ("", self.id, self.passed_over):
+        if not self.held or state is None or state.asks_id in ("", self.id):
             return ""
         return state.asks or "somebody"
 

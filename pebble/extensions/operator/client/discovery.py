@@ -3,7 +3,6 @@
 from pebble.contract import OUTGOING, channel_of
 from pebble.contract.identity import parse_topic
 from pebble.contract.levels import silent_after
-from pebble.extensions.media.rate_meter import RateMeter
 from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.transports import Message
 
@@ -15,7 +14,6 @@ class Discovery:
 
     def __init__(self) -> None:
         self.robots: dict[str, RobotView] = {}
-        self.traffic: dict[str, RateMeter] = {}  # messages of each
 
     def all_robots(self) -> list[RobotView]:
         return list(self.robots.values())  # a copy: robots may be added meanwhile
@@ -36,7 +34,5 @@ class Discovery:
         base = address.identity.base
         robot = self.robots.get(base)
         if robot is None:
-            self.traffic[base] = RateMeter()  # first: other threads look for it once the robot is there
             robot = self.robots[base] = RobotView(base)
-        self.traffic[base].add(now, len(message.payload))
         robot.receive(channel_of(f"{address.direction}/{address.metric}"), message, now, wall)

@@ -17,7 +17,7 @@ from pebble.contract.levels import silent_after
 from pebble.contract.payloads import AutonomyCommand, Drive, EstopCommand
 from pebble.errors import PayloadError
 from pebble.extensions.operator.client.driveable import Driveable, driveable_of
-from pebble.extensions.operator.client.estop_states import RobotEstop
+from pebble.extensions.operator.client.robot_estop import RobotEstop
 from pebble.extensions.operator.client.stamps import stamp_of
 from pebble.motion.latch import is_name, stop_of
 from pebble.transports import Message, QoS

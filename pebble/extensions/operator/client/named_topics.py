@@ -12,7 +12,7 @@ from pebble.contract import DRIVE, ESTOP, INCOMING, codec
 from pebble.contract.identity import ParsedTopic, parse_topic
 from pebble.contract.names import BY, NAME, with_name
 from pebble.errors import PayloadError, TransportError
-from pebble.extensions.operator.client.announced import json_object
+from pebble.extensions.operator.client.assumed import json_object
 from pebble.transports import Message
 
 

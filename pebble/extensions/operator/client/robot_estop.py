@@ -1,4 +1,4 @@
-"""The emergency stop of a robot as its motor owners publish it. Pure."""
+"""The emergency stop of a robot as its motor owners publish it, and the reset of exactly that. Pure."""
 
 from __future__ import annotations
 
@@ -7,12 +7,21 @@ from typing import Any
 
 import msgspec
 
-from pebble.contract import AUTONOMY_COMMAND, CAPABILITIES, CONTROL_STATE, DRIVE, ESTOP_STATE, Channel, codec
+from pebble.contract import (
+    AUTONOMY_COMMAND,
+    CAPABILITIES,
+    CONTROL_STATE,
+    DRIVE,
+    ESTOP_RESET,
+    ESTOP_STATE,
+    Channel,
+    codec,
+)
 from pebble.contract.identity import LEVEL
-from pebble.contract.payloads import EstopState
+from pebble.contract.payloads import EstopReset, EstopState
 from pebble.errors import PayloadError, TransportError
 from pebble.motion.latch import stop_of
-from pebble.transports import Message, Transport
+from pebble.transports import Message, QoS, Transport
 from pebble.transports.topics import check_topic
 
 MAX_OWNERS = 16  # of one robot; a robot that lists more is never confirmed
@@ -163,6 +172,56 @@ class RobotEstop:
             return False
         del states[unlisted]
         return True
+
+
+class Reset:
+    """A reset of exactly the stops that a person was shown; it never ends a later stop."""
+
+    def __init__(self, robot: RobotEstop, by: str) -> None:
+        """Store the states to reset: those that ``robot`` has received until now."""
+        self.robot = robot
+        self.shown = robot.latched
+        _, self._by, _ = stop_of({"by": by})  # as motor owners read it: short printable ASCII
+
+    def messages(self) -> list[Message]:
+        """Return the messages to publish, once: one for each stopped owner."""
+        commands = [EstopReset(boot=state.boot, count=state.count, by=self._by) for state in self.shown.values()]
+        topic, qos = ESTOP_RESET.topic(self.robot.base), QoS(ESTOP_RESET.default_qos)
+        return [Message(topic, codec.encode(ESTOP_RESET, command), qos) for command in commands]
+
+    @property
+    def waiting(self) -> list[str]:
+        """Return the owners that have not answered yet: their states still show the same stop."""
+        return [owner for owner in self.shown if not self._has_answered(owner)]
+
+    def refusals(self) -> dict[str, str]:
+        """Return why owners are still stopped, in words. Call this when no answer is missing, or after a timeout."""
+        return {owner: self._refusal(owner) for owner in self.shown if not self._is_free(owner)}
+
+    def _has_answered(self, owner: str) -> bool:
+        """True if the owner is free or was stopped again.
+
+        A refusal in its state is no answer: it may be about the reset of another client.
+        """
+        before, now = self.shown[owner], self.robot.states.get(owner)
+        return now is not None and (not now.latched or (now.boot, now.count) != (before.boot, before.count))
+
+    def _is_free(self, owner: str) -> bool:
+        state = self.robot.states.get(owner)
+        return state is not None and not state.latched
+
+    def _refusal(self, owner: str) -> str:
+        """Return why an owner is still stopped."""
+        before, now = self.shown[owner], self.robot.states.get(owner)
+        if now is None:
+            return "its state was removed"
+        if now.boot != before.boot:
+            return "it has restarted since"
+        if now.count != before.count:
+            return f"stopped again meanwhile by {now.by or 'unknown'}"
+        if now.reset_refused == "old":
+            return "the reset reached it too late"
+        return "no answer (may this account reset it?)"
 
 
 def _section(value: dict[str, Any], name: str) -> dict[str, Any]:

@@ -11,7 +11,6 @@ from pebble.contract.levels import silent_after
 from pebble.contract.payloads import AutonomyStatus, Drive, EstopState, LinkLevel, LinkState
 from pebble.errors import PayloadError
 from pebble.extensions.operator.client import assumed
-from pebble.extensions.operator.client.announced import announced
 from pebble.extensions.operator.client.control import RobotControl
 from pebble.extensions.operator.client.drive_reasons import SILENT_S, Situation, words
 from pebble.extensions.operator.client.driveable import Driveable, driveable_of, is_held
@@ -164,7 +163,7 @@ class RobotView:
     def _take_announced(self, payload: bytes) -> None:
         """Derive capabilities from the subscriptions in a heartbeat or status, unless the robot publishes its own."""
         if not self.capabilities or "announced" in self.capabilities:
-            value = announced(self.base, payload)
+            value = assumed.announced(self.base, payload)
             if value and value != self.capabilities:
                 self.capabilities = value
 
@@ -236,10 +235,6 @@ class RobotView:
     def live(self) -> bool:
         """True if any message of the robot has arrived that is not retained."""
         return self.liveness.received_at is not None
-
-    @property
-    def transport(self) -> str:
-        return str(section_of(self.capabilities, "transport").get("kind", "?"))
 
     @property
     def latched(self) -> bool:

@@ -25,8 +25,8 @@ from pebble.extensions.operator.client.connection import (
 )
 from pebble.extensions.operator.client.discovery import Discovery
 from pebble.extensions.operator.client.driveable import Driveable, doubt_of
-from pebble.extensions.operator.client.estop_states import Reset, RobotEstop
 from pebble.extensions.operator.client.names import Names, id_of, spellings
+from pebble.extensions.operator.client.robot_estop import Reset, RobotEstop
 from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.extensions.operator.commands import show
 from pebble.extensions.operator.commands.repeated_stop import ANSWER_S, NOTICE_S, stop

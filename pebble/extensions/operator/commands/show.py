@@ -17,8 +17,8 @@ from pebble.contract.identity import parse_topic
 from pebble.contract.payloads import EstopState
 from pebble.extensions.media.rate_meter import RateMeter
 from pebble.extensions.operator.client.discovery import Discovery
-from pebble.extensions.operator.client.estop_states import RobotEstop
 from pebble.extensions.operator.client.names import Names, id_of
+from pebble.extensions.operator.client.robot_estop import RobotEstop
 from pebble.extensions.operator.client.stamps import stamp_of
 from pebble.runtime.output import console
 from pebble.runtime.output import discard_output as discard_output

@@ -24,15 +24,15 @@ from pebble.extensions.operator.client.connection import (
     put_account_into_topics,
     subscribed_stop,
 )
-from pebble.extensions.operator.client.estop_states import RobotEstop
 from pebble.extensions.operator.client.named_topics import moves
 from pebble.extensions.operator.client.names import Names, id_of
+from pebble.extensions.operator.client.robot_estop import RobotEstop
 from pebble.extensions.operator.commands import show
 from pebble.extensions.operator.commands.draft import draft
-from pebble.extensions.operator.commands.expand import expand
+from pebble.extensions.operator.commands.options import CaCert, PasswordFile
 from pebble.extensions.operator.commands.target import with_target
 from pebble.extensions.operator.commands.topic_contract import contract
-from pebble.extensions.operator.signals import until_ended
+from pebble.extensions.operator.signals import interrupted_by_signals, until_ended
 from pebble.transports import QoS, Transport
 from pebble.transports.topics import is_pattern
 
@@ -217,6 +217,32 @@ def hz(topic: Name, window: WindowOption = 100, seconds: SecondsOption = None, *
                 reported = meter.count
         _warn_of_dropped(listener)
     return 0 if meter.count else 1
+
+
+def expand(
+    url: Annotated[str, typer.Argument(help="The broker, as mqtt://ops@host.", metavar="URL", show_default=False)],
+    password_file: PasswordFile = None,
+    ca_cert: CaCert = None,
+) -> int:
+    """Take groups of streams apart beside a broker, until it is interrupted.
+
+    A robot on a thin link with `group_hz` in its config sends its streams together, while this runs; every program at
+    the broker sees the plain topics.
+
+    \b
+        pebble topic expand mqtt://127.0.0.1
+    """
+    from pebble.extensions.thin.expander import ANNOUNCE_S, Expander
+
+    target = Target(url=url, password_file=password_file, ca_cert=ca_cert, program="expand")
+    with interrupted_by_signals(), until_ended(), connected(target) as (transport, names):
+        expander = Expander(transport)
+        put_account_into_topics(transport, names, expander.is_named)
+        expander.start()
+        while True:
+            expander.announce()
+            time.sleep(ANNOUNCE_S)
+    return 0
 
 
 def _print_rate(meter: RateMeter, *, silent: bool) -> None:

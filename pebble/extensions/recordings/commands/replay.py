@@ -14,8 +14,7 @@ import typer
 
 from pebble.config.visible import shown
 from pebble.errors import PebbleError
-from pebble.extensions.operator.client.connection import password
-from pebble.extensions.operator.client.url import settings_of
+from pebble.extensions.operator.client.url import password, settings_of
 from pebble.extensions.operator.commands import show
 from pebble.extensions.operator.commands.options import CaCert, PasswordFile
 from pebble.extensions.operator.signals import handled_by

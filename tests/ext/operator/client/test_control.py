@@ -13,8 +13,8 @@ from pebble.contract import CAPABILITIES, CONTROL, CONTROL_STATE, codec
 from pebble.contract.payloads import ControlRequest, ControlState, LinkState
 from pebble.extensions.operator.client.control import ASKS_S, ControlClient, RobotControl
 from pebble.extensions.operator.client.driveable import doubt_of, driveable_of, is_cut_off
-from pebble.extensions.operator.client.estop_states import MAX_OWNERS, Reset, RobotEstop
 from pebble.extensions.operator.client.pace_of_link import WIDE, pace_of
+from pebble.extensions.operator.client.robot_estop import MAX_OWNERS, Reset, RobotEstop
 from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.transports import Message
 from tests.ext.operator.client.estop_robot import KeepingRobot, Robot, capabilities, outgoing
@@ -136,8 +136,6 @@ def test_who_is_not_let_drive_asks_no_more_after_a_while() -> None:
     for _ in range(round((ASKS_S + 1) / STEP_S)):
         world.drive(ann)
         world.wait(STEP_S)
-        ann.keep()
-        assert ann.asked_by == ""
     assert (world.held, bob.wanted, bob.failed) == ([True, False], False, "ann drives on")
     world.wait(3.0)
     assert ann.robot.state is not None
@@ -197,16 +195,14 @@ def test_random_schedules_never_have_two_holders_and_end_with_one() -> None:
         world.lost = silent.__contains__
         for _ in range(40):
             one = chance.choice(clients)
-            match chance.randrange(8):
+            match chance.randrange(7):
                 case 0 | 1:
                     one.ask(world.now, over=chance.random() < 0.3)
                 case 2:
                     one.release()
                 case 3:
-                    one.keep()
-                case 4:
                     silent.symmetric_difference_update({one})
-                case 5:
+                case 4:
                     chance.choice(world.robot.owners).start(world.now)
                     world.receive(world.robot.states())
                 case _:
@@ -351,10 +347,10 @@ def test_a_reset_frees_each_owner_by_its_own_boot_and_count() -> None:
         {"boot": "00000001", "count": 1, "by": "ann@desk"},
     ]
     assert {message.topic for message in reset.messages()} == {f"{GOOB}/incoming/estop-reset"}
-    assert (reset.waiting, reset.free) == (["left", "right"], False)
+    assert reset.waiting == ["left", "right"]
     publish(estop, robot.take(reset.messages()))
     assert estop.states["left"].reset_refused == "boot", "by the other owner's reset, which does not matter"
-    assert (reset.waiting, reset.free, reset.refusals()) == ([], True, {})
+    assert (reset.waiting, reset.refusals()) == ([], {})
 
 
 def test_only_stopped_owners_are_reset() -> None:
@@ -372,7 +368,7 @@ def test_a_reset_ends_no_stop_that_was_not_shown() -> None:
     assert [json.loads(message.payload)["count"] for message in reset.messages()] == [1]
     publish(estop, robot.take(reset.messages()))
     assert robot.owners[0].latch.latched
-    assert (reset.waiting, reset.free) == ([], False)
+    assert reset.waiting == []
     assert reset.refusals() == {"serial": "stopped again meanwhile by bob"}
 
 

@@ -15,7 +15,7 @@ from pebble import contract as c
 from pebble.contract import CAPABILITIES, DRIVE, ESTOP_STATE, LINK, ONLINE
 from pebble.contract.levels import LEVELS, silent_after
 from pebble.contract.payloads import Drive, LinkLevel, LinkState
-from pebble.extensions.operator.client.announced import announced
+from pebble.extensions.operator.client.assumed import announced
 from pebble.extensions.operator.client.discovery import Discovery
 from pebble.extensions.operator.client.estop import COLLECT_S, StopSender, new_name
 from pebble.extensions.operator.client.pace_of_link import WIDE, Pace, pace_of
@@ -106,7 +106,7 @@ def test_topics_of_another_robot_in_capabilities_are_not_used() -> None:
 )
 def test_only_what_a_robot_offers_is_assumed_of_it(drive: dict[str, object], drives: bool, arbitrates: bool) -> None:
     discovery = Discovery()
-    value = {"drive": drive, "transport": {"kind": "zenoh"}}
+    value = {"drive": drive}
     publish(discovery, "capabilities", {"schema": "pebble-capabilities/v1", "t": 1, "value": value}, retain=True)
     publish(discovery, "autonomy-status", {"timestamp": 1, "running": True})
     publish(discovery, "charging-level", {"value": 7.4})
@@ -115,7 +115,7 @@ def test_only_what_a_robot_offers_is_assumed_of_it(drive: dict[str, object], dri
     seen = publish_heartbeats(discovery).situation(1.9)
     assert (seen.drives, seen.arbitrates, seen.script, seen.online) == (drives, arbitrates, True, True)
     robot = discovery.robots[BASE]
-    assert (robot.transport, robot.volts, discovery.traffic[BASE].count) == ("zenoh", 7.4, 8)
+    assert robot.volts == 7.4
     assert (robot.liveness.online(0.9), robot.liveness.online(1.01)) == (True, False)
     assert robot.online(2.1) is False, "people are told after 1.5 s"
     publish(discovery, "online", {"t": int(WALL * 1000), "online": False}, now=0.6)
