@@ -18,10 +18,8 @@ import pytest
 
 from pebble.config import load
 from pebble.config.raw import deep_merge
-from pebble.errors import ConfigError
 from pebble.extensions.fleet import authority, certificates
 from pebble.extensions.fleet.folder import FLEET, ZENOH
-from pebble.extensions.fleet.gateway.gateway_file import load_gateway
 from pebble.extensions.fleet.hub_access import read_access
 from pebble.extensions.fleet.hub_file import load_hub
 from pebble.extensions.fleet.people import People
@@ -58,14 +56,14 @@ def pebble(line: str, folder: Path) -> subprocess.CompletedProcess[str]:
 
 
 @contextmanager
-def mosquitto(conf: Path, port: int) -> Iterator[None]:
-    with (conf.parent / "log").open("ab") as log:
-        process = Child([str(mosquitto_path()), "-c", str(conf)], cwd=conf.parent.parent, stdout=log, stderr=log)
+def started(command: list[str], folder: Path) -> Iterator[None]:
+    """A program that runs until it is ended."""
+    with (folder / "log").open("ab") as log:
+        process = Child(command, cwd=folder, stdout=log, stderr=log)
     try:
-        assert until(lambda: listening(port)), (conf.parent / "log").read_text()
         yield
     finally:
-        process.kill()
+        process.terminate()
         process.wait(WAIT_S)
 
 
@@ -85,7 +83,8 @@ def test_the_first_page_as_a_newcomer_types_it(
 
     shown = shown_by(init.replace("broker.lab", f"127.0.0.1 --port {port} --level {level}"))
     assert shown.count(start.split("  ")[0]) == 1
-    with mosquitto(tmp_path / start.split()[2], port):
+    with started([str(mosquitto_path()), *start.split()[1:3]], tmp_path):
+        assert until(lambda: listening(port)), (tmp_path / "log").read_text()
         for line in accounts:
             shown = shown_by(line)
             passwords[line.split()[3]] = PASSWORD.findall(shown)[0]
@@ -95,7 +94,8 @@ def test_the_first_page_as_a_newcomer_types_it(
         for name, password in passwords.items():
             (tmp_path / f"{name}-password").write_text(f"{password}\n")
         place = Place("127.0.0.1", port, tmp_path / "hall" / "ca.pem")
-        with BrokerClient(place, "minilamp", passwords["minilamp"]) as robot, typed(simulate, tmp_path):
+        simulation = started(python("pebble.cli", *words(simulate)), tmp_path)
+        with BrokerClient(place, "minilamp", passwords["minilamp"]) as robot, simulation:
             robot.subscribe([f"{LAMP}/incoming/#", f"{LAMP}/outgoing/estop/#"])
             with closing(Terminal(*python("pebble.cli", *shlex.split(drive)[1:]), cwd=tmp_path)) as console:
                 assert console.sees("ready"), console.shown
@@ -108,18 +108,6 @@ def test_the_first_page_as_a_newcomer_types_it(
     assert list(passwords) == ["goob", "fred", "minilamp", "ann", "otto"]
     search = ["grep", "-rlE", "|".join(passwords.values()), str(tmp_path / "hall")]
     assert subprocess.run(search, check=False, capture_output=True).stdout == b""  # no file has one of them
-
-
-@contextmanager
-def typed(line: str, folder: Path) -> Iterator[None]:
-    """A program that runs until it is ended."""
-    with (folder / "simulation.log").open("ab") as log:
-        process = Child(python("pebble.cli", *words(line)), cwd=folder, stdout=log, stderr=log)
-    try:
-        yield
-    finally:
-        process.terminate()
-        process.wait(WAIT_S)
 
 
 def _merged(piece: dict[str, Any], folder: Path) -> Path:
@@ -263,9 +251,9 @@ def test_two_robots_of_a_lan_and_a_board_receive_each_other_in_six_commands(tmp_
 
     with ExitStack() as stack:
         for line in starts:
-            stack.enter_context(typed(line, tmp_path))
-            assert until(lambda: listening(hub), 60), (tmp_path / "simulation.log").read_text()
-        assert until(receives_both, 60), (tmp_path / "simulation.log").read_text()
+            stack.enter_context(started(python("pebble.cli", *words(line)), tmp_path))
+            assert until(lambda: listening(hub), 60), (tmp_path / "log").read_text()
+        assert until(receives_both, 60), (tmp_path / "log").read_text()
 
 
 def test_a_bridge_notes_what_passes_and_a_command_prints_it(
@@ -307,12 +295,6 @@ HUB = {"connect": ["tcp/127.0.0.1:1"]}
 BOARDS = {"id": "g", "hub": {}, "boards": {}}
 
 
-def settings_in(folder: Path, name: str, **settings: Any) -> Path:
-    file = folder / name
-    file.write_text(json.dumps(settings), encoding="utf-8")
-    return file
-
-
 @pytest.mark.parametrize(
     ("settings", "complaint"),
     [
@@ -331,20 +313,16 @@ def settings_in(folder: Path, name: str, **settings: Any) -> Path:
         ({**BOARDS, "neighbours": {f"a/b/c{n}": {"lan": HUB} for n in range(17)}}, "has 17 robots: 16 are the most"),
     ],
 )
-def test_a_gateway_that_cannot_work_is_refused(tmp_path: Path, settings: dict[str, Any], complaint: str) -> None:
-    with pytest.raises(ConfigError) as refused:
-        load_gateway(settings_in(tmp_path, "gate.json", **{"hub": HUB, **settings}))
-    assert complaint in str(refused.value)
-
-
-def test_a_refused_gateway_is_a_complaint_and_exit_code_1(run: Run, tmp_path: Path) -> None:
-    assert run("fleet", "gateway", settings_in(tmp_path, "gate.json", hub=HUB)) == 1
-    assert "gate.json: id: is missing" in run.err
+def test_a_gateway_that_cannot_work_is_refused(
+    run: Run, tmp_path: Path, settings: dict[str, Any], complaint: str
+) -> None:
+    assert run("fleet", "gateway", _written({"hub": HUB, **settings}, tmp_path, "gate")) == 1
+    assert complaint in run.err
 
 
 def test_a_hub_names_where_it_listens(tmp_path: Path) -> None:
     settings = {"run_dir": str(tmp_path / "a"), "listen": [f"tcp/127.0.0.1:{free_port()}"], "journal": "a.journal"}
-    with running("fleet", "hub", settings_in(tmp_path, "a.json", **settings)):
+    with running("fleet", "hub", _written(settings, tmp_path, "a")):
         assert until((tmp_path / "a" / "hub.sock").exists)
 
 
@@ -358,5 +336,5 @@ def test_a_hub_names_where_it_listens(tmp_path: Path) -> None:
     ],
 )
 def test_a_hub_that_cannot_work_is_refused(run: Run, tmp_path: Path, settings: dict[str, Any], complaint: str) -> None:
-    assert run("fleet", "hub", settings_in(tmp_path, "hub.json", run_dir=str(tmp_path / "hub"), **settings)) == 1
+    assert run("fleet", "hub", _written({"run_dir": str(tmp_path / "hub"), **settings}, tmp_path, "hub")) == 1
     assert complaint in run.err
