@@ -7,7 +7,6 @@ import os
 import pty
 import re
 import signal
-import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -271,40 +270,32 @@ def test_a_hold_stops_robots_that_come_online_later(robot_on: Make, url: str) ->
     assert f"{late.id}: was stopped, and reset since" in out
 
 
-@pytest.fixture
-def brittle(tmp_path: Path) -> Iterator[Broker]:
-    """A broker that a test may kill."""
-    broker = Broker(tmp_path)
-    yield broker
-    broker.stop()
-
-
-def await_stop(process: subprocess.Popen[str], broker: Broker, robot: RecordingRobot, waits: str) -> None:
-    """Start the broker once the command says that it ``waits``, and await the confirmation."""
-    assert process.stderr is not None
-    assert process.stderr.readline().startswith(f"pebble: {waits}")
-    robot.deaf = False
-    broker.start()
-    out, _ = process.communicate(timeout=50)
-    assert process.returncode == 0, out
-    assert robot.latched
-
-
-def test_a_lost_broker_is_waited_for(brittle: Broker) -> None:
-    with RecordingRobot(brittle.port, "pebble/robots/lost", heartbeats=False) as robot:
+@pytest.mark.parametrize(
+    ("is_there_at_first", "waits"),
+    [
+        (True, "warning: nothing is sent until there is a connection: "),
+        (False, "the stop is NOT SENT YET: connecting to mqtt://127.0.0.1:"),
+    ],
+)
+def test_a_broker_that_is_lost_or_restarts_is_waited_for(tmp_path: Path, is_there_at_first: bool, waits: str) -> None:
+    with ExitStack() as opened:
+        broker = Broker(tmp_path)
+        opened.callback(broker.stop)
+        robot = opened.enter_context(RecordingRobot(broker.port, "pebble/robots/lost", heartbeats=False))
         robot.publish_states()
         robot.deaf = True
-        with running("estop", robot.id, f"--url=mqtt://127.0.0.1:{brittle.port}") as process:
+        if not is_there_at_first:
+            broker.kill()
+        process = opened.enter_context(running("estop", robot.id, f"--url=mqtt://127.0.0.1:{broker.port}"))
+        if is_there_at_first:
             assert until(lambda: robot.count("estop") >= 1)
-            brittle.kill()
-            await_stop(process, brittle, robot, "warning: nothing is sent until there is a connection: ")
-
-
-def test_a_broker_that_restarts_is_waited_for(brittle: Broker) -> None:
-    with RecordingRobot(brittle.port, "pebble/robots/lost", heartbeats=False) as robot:
-        brittle.kill()
-        with running("estop", robot.id, f"--url=mqtt://127.0.0.1:{brittle.port}") as process:
-            await_stop(process, brittle, robot, "the stop is NOT SENT YET: connecting to mqtt://127.0.0.1:")
+            broker.kill()
+        assert process.stderr is not None
+        assert process.stderr.readline().startswith(f"pebble: {waits}")
+        robot.deaf = False
+        broker.start()
+        out, _ = process.communicate(timeout=50)
+        assert (process.returncode, robot.latched) == (0, True), out
 
 
 NOWHERE = "nothing listens there, is it up?"
