@@ -44,7 +44,15 @@ class Database:
                 require_own(path.parent)  # another user may have been faster
                 if not path.exists():
                     os.close(os.open(path, os.O_RDWR | os.O_CREAT, 0o600))
-            self._connection = _connection(path, tables)
+                if path.is_dir():
+                    raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+                set_mode(path, 0o600)
+            where = ":memory:" if path is None else str(path)
+            self._connection = sqlite3.connect(where, _BUSY_S, isolation_level=None, check_same_thread=False)
+            self._connection.execute("PRAGMA journal_mode = WAL")
+            self._connection.execute("PRAGMA synchronous = NORMAL")
+            self._connection.execute("PRAGMA foreign_keys = ON")
+            self._connection.executescript(tables)
             upgrade(self._connection)
             self._own = None if path is None else OwnFile(path)
         except (OSError, sqlite3.Error) as error:
@@ -101,18 +109,3 @@ class Database:
 
     def close(self) -> None:
         self._connection.close()
-
-
-def _connection(path: Path | None, tables: str) -> sqlite3.Connection:
-    """Open the file, which exists already, and create missing tables. Raises OSError and sqlite3.Error."""
-    if path is not None:
-        if path.is_dir():
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-        set_mode(path, 0o600)
-    where = ":memory:" if path is None else str(path)
-    connection = sqlite3.connect(where, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
-    connection.execute("PRAGMA journal_mode = WAL")
-    connection.execute("PRAGMA synchronous = NORMAL")
-    connection.execute("PRAGMA foreign_keys = ON")
-    connection.executescript(tables)
-    return connection

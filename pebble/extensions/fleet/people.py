@@ -41,10 +41,6 @@ CREATE TABLE IF NOT EXISTS settings (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 """
 
 
-class PeopleError(PebbleError):
-    """An error: a name, password or role cannot be used. Example: ``alice exists already``."""
-
-
 class TooManyTriesError(PebbleError):
     """An error: too many password tries from one address or for one name. ``wait_s``: seconds until the next."""
 
@@ -92,7 +88,7 @@ class People:
     # -- people
 
     def add(self, name: str, password: str, role: Role) -> None:
-        """Add a person. Raises PeopleError."""
+        """Add a person. Raises PebbleError."""
         self.check_name(name)
         salt = secrets.token_bytes(16)
         values = (name, role.value, salt, _hash(usable(password), salt))
@@ -102,25 +98,25 @@ class People:
             raise _exists(name) from None
 
     def check_name(self, name: str) -> None:
-        """Raise PeopleError for a name that cannot be used."""
+        """Raise PebbleError for a name that cannot be used."""
         if not NAME.fullmatch(name):
-            raise PeopleError(f"{name!r} is no name: use 1 to 32 of a-z, 0-9, _ and -")
+            raise PebbleError(f"{name!r} is no name: use 1 to 32 of a-z, 0-9, _ and -")
         if self._rows("SELECT 1 FROM people WHERE name = ?", name):
             raise _exists(name)
 
     def remove(self, name: str) -> None:
-        """Remove a person and end their sessions. Raises PeopleError."""
+        """Remove a person and end their sessions. Raises PebbleError."""
         self._change_one(name, "DELETE FROM people WHERE name = ?", name)
 
     def set_password(self, name: str, password: str) -> None:
-        """Change a password and end the person's sessions. Raises PeopleError."""
+        """Change a password and end the person's sessions. Raises PebbleError."""
         salt = secrets.token_bytes(16)
         hashed = _hash(usable(password), salt)
         self._change_one(name, "UPDATE people SET salt = ?, hash = ? WHERE name = ?", salt, hashed, name)
         self._change("DELETE FROM sessions WHERE name = ?", name)
 
     def set_role(self, name: str, role: Role) -> None:
-        """Change a person's role, in running sessions too. Raises PeopleError."""
+        """Change a person's role, in running sessions too. Raises PebbleError."""
         self._change_one(name, "UPDATE people SET role = ? WHERE name = ?", role.value, name)
 
     def list(self) -> list[User]:
@@ -236,11 +232,11 @@ class People:
 
     def _change_one(self, name: str, statement: str, *values: Any) -> None:
         if self._change(statement, *values) == 0:
-            raise PeopleError(f"there is no {name!r}: `pebble web user list` lists the names")
+            raise PebbleError(f"there is no {name!r}: `pebble web user list` lists the names")
 
 
-def _exists(name: str) -> PeopleError:
-    return PeopleError(f"{name} exists already: change the password or the role, or remove {name}")
+def _exists(name: str) -> PebbleError:
+    return PebbleError(f"{name} exists already: change the password or the role, or remove {name}")
 
 
 def has_user(path: Path | None, name: str = "") -> bool:
@@ -270,10 +266,10 @@ def _has_user(path: Path, name: str) -> bool:
 
 
 def usable(password: str) -> str:
-    """Return the password in the form in which it is stored (NFC). Raises PeopleError."""
+    """Return the password in the form in which it is stored (NFC). Raises PebbleError."""
     password = normalize("NFC", password)
     if not MIN_PASSWORD <= len(password) <= MAX_PASSWORD:
-        raise PeopleError(f"a password has {MIN_PASSWORD} to {MAX_PASSWORD} characters")
+        raise PebbleError(f"a password has {MIN_PASSWORD} to {MAX_PASSWORD} characters")
     return password
 
 

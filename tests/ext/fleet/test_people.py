@@ -14,7 +14,7 @@ import pytest
 
 from pebble.errors import PebbleError
 from pebble.extensions.fleet.database import DatabaseError
-from pebble.extensions.fleet.people import SESSION_S, People, PeopleError, TooManyTriesError, User, has_user
+from pebble.extensions.fleet.people import SESSION_S, People, TooManyTriesError, User, has_user
 from pebble.extensions.fleet.roles import Role, page_rights
 from pebble.extensions.fleet.tries import TRIES, WINDOW_S, network_of
 from tests.support import Clock
@@ -143,28 +143,28 @@ def test_one_network_of_ipv6_is_one_address(people: People) -> None:
 
 @pytest.mark.parametrize("name", ["", "Alice", "a" * 33, "anna/drive-values", "ä", "alice\n", "+"])
 def test_names_that_could_be_part_of_a_topic_are_refused(people: People, name: str) -> None:
-    with pytest.raises(PeopleError, match="is no name"):
+    with pytest.raises(PebbleError, match="is no name"):
         people.add(name, PASSWORD, Role.VIEWER)
 
 
 @pytest.mark.parametrize("password", ["", "1234567", "x" * 257, "o\u0308" * 7])
 def test_the_length_of_a_password(people: People, password: str) -> None:
-    with pytest.raises(PeopleError, match="a password has 8 to 256 characters"):
+    with pytest.raises(PebbleError, match="a password has 8 to 256 characters"):
         people.add("bob", password, Role.VIEWER)
-    with pytest.raises(PeopleError, match="a password has 8 to 256 characters"):
+    with pytest.raises(PebbleError, match="a password has 8 to 256 characters"):
         people.set_password("alice", password)
     people.set_password("alice", "x" * 256)
 
 
 def test_names_are_unique_and_must_exist(people: People) -> None:
-    with pytest.raises(PeopleError, match="alice exists already"):
+    with pytest.raises(PebbleError, match="alice exists already"):
         people.add("alice", PASSWORD, Role.VIEWER)
     for change in (
         lambda: people.remove("bob"),
         lambda: people.set_password("bob", PASSWORD),
         lambda: people.set_role("bob", Role.ADMIN),
     ):
-        with pytest.raises(PeopleError, match="there is no 'bob'"):
+        with pytest.raises(PebbleError, match="there is no 'bob'"):
             change()
     assert people.list() == [User("alice", Role.DRIVER)]
 

@@ -43,10 +43,6 @@ _STOP_END = f"/{ESTOP.metric}"
 _decode, _encode = msgspec.json.Decoder(GatewayHeartbeat).decode, msgspec.json.encode
 
 
-class SecondGatewayError(PebbleError):
-    """An error at the start: another gateway already carries these robots."""
-
-
 def will(name: str) -> Message:
     """Return the will, by which other gateways learn that this one is gone."""
     return Message(ONLINE.topic(Identity("pebble", GATEWAYS, name).base), b"", QoS.DELIVERED, True)
@@ -142,7 +138,7 @@ class Gateway:
     # -- the life of the program
 
     def run(self, ready: Callable[[], None] = lambda: None) -> None:
-        """Run until :meth:`quit`. Raises SecondGatewayError if another gateway carries its robots at the start."""
+        """Run until :meth:`quit`. Raises PebbleError if another gateway carries its robots at the start."""
         try:
             self.open()
             ready()
@@ -213,13 +209,13 @@ class Gateway:
         return all(transport.state is State.CONNECTED for transport in (self._hub, self._broker, self._presence))
 
     def _leave_to_others(self, now: float) -> None:
-        """Stop carrying robots that another gateway carries; at the start, raise SecondGatewayError for them."""
+        """Stop carrying robots that another gateway carries; at the start, raise PebbleError for them."""
         for base in list(self._heard):
             other = self._others.carrier(base, now, carried=base in self._carried)
             if not other:
                 continue
             if not self._has_begun:
-                raise SecondGatewayError(
+                raise PebbleError(
                     f"gateway {self._name} does not start: {other} carries {base} already. One gateway carries the "
                     "robots of a LAN"
                 )

@@ -16,13 +16,6 @@ from pebble.extensions.operator.client.assumed import json_object
 from pebble.transports import Message
 
 
-class NoNameError(TransportError):
-    """An error: a command has no name. Example: ``goob takes commands only with a name: log in at its broker, …``."""
-
-    def __init__(self, name: str, account: str) -> None:
-        super().__init__(why_not(name, account))
-
-
 def why_not(name: str, account: str) -> str:
     """Return why a robot does not take commands of this account, and what to do; empty if it does."""
     if NAME.fullmatch(account):
@@ -39,7 +32,7 @@ class NamedTopics:
         self._is_named = is_named
 
     def forms(self, message: Message) -> Iterator[Message]:
-        """Yield the messages to publish instead of this one. Raises NoNameError.
+        """Yield the messages to publish instead of this one. Raises TransportError.
 
         A stop needs no account: it is also published unchanged, and first. Without an account, a zero is published
         unchanged. No message on a topic with an account is retained: the robot itself retains its flags.
@@ -57,7 +50,7 @@ class NamedTopics:
         elif command.metric == DRIVE.metric and not moves(message.payload):
             yield message
         elif not is_stop:
-            raise NoNameError(command.identity.id, self.account)
+            raise TransportError(why_not(command.identity.id, self.account))
 
     def signed(self, topic: str, payload: bytes, person: str) -> bytes:
         """Return a command's payload with the person for whom this client acts, if the robot needs accounts in topics.

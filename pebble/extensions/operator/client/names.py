@@ -14,10 +14,6 @@ ANY_ROBOT = "+/+/+"
 _USUAL = "pebble/robots/"  # before the id alone
 
 
-class NamingError(PebbleError):
-    """An error: no topic has this name. Example: ``there is no topic "drive-value": did you mean "drive-values"?``."""
-
-
 class Names:
     """The names of topics of one robot, including those that its config renames, or of every robot."""
 
@@ -38,7 +34,7 @@ class Names:
         channel = self._find(name, (INCOMING, OUTGOING))
         topic = name if channel is None else self._place(channel, name)
         if is_pattern(topic):
-            raise NamingError(
+            raise PebbleError(
                 f"{name} is not one topic: select the robot by --config or --robot, or give a whole topic"
             )
         return topic
@@ -85,7 +81,7 @@ def base_of(robot: str) -> str:
     if len(levels) == 1:
         levels = f"{_USUAL}{robot}".split("/")
     if len(levels) != 3:
-        raise NamingError(f'--robot {robot}: give its id, or "system/type/id"')
+        raise PebbleError(f'--robot {robot}: give its id, or "system/type/id"')
     return Identity(*map(composed, levels)).base  # composed: an accent may come as a character of its own
 
 
@@ -108,13 +104,13 @@ def _with_synonyms(channel: Channel) -> Iterator[Channel]:
 
 
 def _refuse_misspelt(name: str) -> None:
-    """Raise NamingError if ``name`` looks like a misspelt topic of the contract: it resembles one, or has no slash.
+    """Raise PebbleError if ``name`` looks like a misspelt topic of the contract: it resembles one, or has no slash.
 
     Other names are allowed, because a broker may carry topics outside the contract.
     """
     spellings = {spelling for channel in CHANNELS for spelling in (channel.metric, channel.suffix)}
     near = difflib.get_close_matches(name, sorted(spellings), n=1)
     if near:
-        raise NamingError(f'there is no topic "{name}": did you mean "{near[0]}"?')
+        raise PebbleError(f'there is no topic "{name}": did you mean "{near[0]}"?')
     if "/" not in name:
-        raise NamingError(f'there is no topic "{name}"; `pebble topic contract` lists all topics')
+        raise PebbleError(f'there is no topic "{name}"; `pebble topic contract` lists all topics')

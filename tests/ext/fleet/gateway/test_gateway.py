@@ -13,9 +13,10 @@ import msgspec
 import pytest
 
 from pebble.contract import ONLINE
+from pebble.errors import PebbleError
 from pebble.extensions.fleet.gateway import gateway as module
 from pebble.extensions.fleet.gateway.carried_robot import LARGEST, Beginning
-from pebble.extensions.fleet.gateway.gateway import SILENT_S, TICK_S, Gateway, SecondGatewayError, will
+from pebble.extensions.fleet.gateway.gateway import SILENT_S, TICK_S, Gateway, will
 from pebble.transports import Message, clock
 from tests.forwarding.virtual import Connection, Hub
 from tests.services.mqtt_bridge.bridge_rig import Client
@@ -301,7 +302,7 @@ def test_robots_beyond_the_bound_are_not_carried(monkeypatch: pytest.MonkeyPatch
 
 def test_a_second_one_does_not_start_and_names_the_first(alone: World) -> None:
     alone.running["b"] = Running(alone, "b")
-    with pytest.raises(SecondGatewayError, match=f"gateway b does not start: a carries {GOOB} already"):
+    with pytest.raises(PebbleError, match=f"gateway b does not start: a carries {GOOB} already"):
         alone.run(3)
     del alone.running["b"]
     assert alone.all_pass()

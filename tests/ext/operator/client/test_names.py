@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from pebble.errors import PebbleError
-from pebble.extensions.operator.client.named_topics import NamedTopics, NoNameError
+from pebble.extensions.operator.client.named_topics import NamedTopics
 from pebble.extensions.operator.client.names import Names, base_of
 from pebble.extensions.operator.client.url import UrlError, settings_of
 from pebble.runtime.connections import ALL_VITAL
@@ -89,7 +89,7 @@ def test_each_message_has_the_topic_that_its_robot_reads(
 @pytest.mark.parametrize("metric", ["drive-values", "estop-reset"])
 def test_without_a_name_one_line_shows_what_to_type(account: str, metric: str) -> None:
     with pytest.raises(
-        NoNameError, match=r"^goob takes commands only with a name, .*: log in .* --url mqtts://"
+        PebbleError, match=r"^goob takes commands only with a name, .*: log in .* --url mqtts://"
     ) as one:
         list(topics(account, GOOB).forms(Message(f"{GOOB}/incoming/{metric}", MOVE)))
     assert "\n" not in str(one.value)
