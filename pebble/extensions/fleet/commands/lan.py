@@ -6,12 +6,11 @@ Each robot and each board is a *neighbour* at the hub of the LAN: it may receive
 from __future__ import annotations
 
 import json
+import os
 import signal
-import subprocess
 import sys
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -97,6 +96,7 @@ def up(folder_: Annotated[Path, typer.Argument(metavar="FOLDER", help="Of the fl
     \b
         pebble fleet up hall
     """
+    from pebble.extensions.media.child import Child
     from pebble.runtime.signals import EndSignal
     from pebble.transports.peers import FileLock
 
@@ -108,13 +108,17 @@ def up(folder_: Annotated[Path, typer.Argument(metavar="FOLDER", help="Of the fl
     if (lock := FileLock.take(place / _LOCK)) is None:
         raise FleetError(f"{folder_} runs already: another `pebble fleet up` holds {folder_ / _LOCK}")
     ends = EndSignal()
+    running: dict[str, Child] = {}
     with ExitStack() as stack:
         stack.callback(lock.release)
-        running = {name: stack.enter_context(_running(command)) for name, command in commands.items()}
+        for name, command in commands.items():
+            program = running[name] = Child(command, os.environ, tie=signal.SIGTERM)
+            stack.callback(program.finish, _END_S)  # ended one after the other, the newest first
+            stack.callback(program.signal, signal.SIGTERM)
         typer.echo(f"{', '.join(running)} of {folder_}; Ctrl-C ends them", err=True)
         while not ends.wait(_LOOK_S):
-            for name, process in running.items():
-                if (code := process.poll()) is not None:
+            for name, program in running.items():
+                if (code := program.wait(0.0)) is not None:
                     raise PebbleError(
                         f"{name} has ended with code {code}, so all others end, too: read what it said, and start again"
                     )
@@ -133,26 +137,6 @@ def _commands(place: Path) -> dict[str, list[str]]:
     # a broker that runs already is not started again
     broker = {} if applying.pid_of(place) else {"broker": [mosquitto, "-c", str(place / CONF)]}
     return broker | hub | {"gateway": [*pebble, "fleet", "gateway", str(place / GATEWAY_FILE)]}
-
-
-@contextmanager
-def _running(command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a program during the block, then end it; kill it if that takes too long.
-
-    It has a session of its own, so Ctrl-C reaches only this command, which ends its programs one after the other.
-    """
-    from pebble.extensions.media.child import tied_to_parent
-
-    process = subprocess.Popen(tied_to_parent(command, signal.SIGTERM), start_new_session=True)
-    try:
-        yield process
-    finally:
-        process.terminate()
-        try:
-            process.wait(_END_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
 
 
 def _accounts(fleet: Fleet, robots: list[str], boards: list[str]) -> Fleet:
