@@ -18,6 +18,7 @@ from pathlib import Path
 import pytest
 
 from pebble.contract import CAPABILITIES, DRIVE, ESTOP, ONLINE
+from pebble.extensions.fleet.commands.gateway import gateway
 from pebble.extensions.scripts.script import Robot
 from pebble.transports import Message, MqttSettings, QoS, Transport, ZenohSettings, create
 from pebble.transports.memory import MemoryTransport
@@ -30,6 +31,11 @@ from tests.transports.zenoh_net import HubProcess
 pytestmark = pytest.mark.alone
 STOP_S = 1.0
 ROBOT = "pebble/robots/r0"
+
+
+def main(file: str) -> int:
+    """`pebble fleet gateway` in a forked process."""
+    return gateway(Path(file))
 
 
 class Gateways:
@@ -50,7 +56,7 @@ class Gateways:
         """Start a gateway to the operators' broker."""
         file = self._folder / f"{name}.json"
         file.write_text(json.dumps({"id": name, "mqtt": {"host": "127.0.0.1", "port": self.broker.port}, **sides}))
-        process = Forked("tests.ext.fleet.gateway_process", str(file))
+        process = Forked(__name__, str(file))
         self._stack.callback(process.wait, 10)
         self._stack.callback(process.kill)
         return process
