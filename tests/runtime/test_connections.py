@@ -19,8 +19,8 @@ import pytest
 from pebble.config import parse
 from pebble.contract import ESTOP
 from pebble.errors import PebbleError
+from pebble.extensions.fleet.files import GatewayFile, gateway_transports
 from pebble.extensions.fleet.gateway.gateway import will
-from pebble.extensions.fleet.gateway.gateway_file import GatewayFile, gateway_transports
 from pebble.runtime.connections import hub_settings, local_settings, mqtt_settings, remote_transport, stops_transport
 from pebble.runtime.environment import child_environment, withhold
 from pebble.runtime.hub import WILLS

@@ -41,8 +41,8 @@ def gateway(
     instead of "hub". With "neighbours" as well, robots at the LAN's hub can
     receive from the boards and drive them.
     """
+    from pebble.extensions.fleet.files import gateway_transports, load_gateway
     from pebble.extensions.fleet.gateway.gateway import Gateway, will
-    from pebble.extensions.fleet.gateway.gateway_file import gateway_transports, load_gateway
     from pebble.runtime.parent import Notifier, set_up_logging
     from pebble.services.neighbours.board import of_board
 

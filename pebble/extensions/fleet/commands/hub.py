@@ -22,7 +22,7 @@ def hub(
     \b
         pebble fleet hub hub1.json
     """
-    from pebble.extensions.fleet.hub_file import load_hub
+    from pebble.extensions.fleet.files import load_hub
     from pebble.runtime.as_owner import require_own
     from pebble.runtime.hub import run_hub  # of Linux only
     from pebble.runtime.parent import set_up_logging

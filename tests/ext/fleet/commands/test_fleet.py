@@ -19,9 +19,9 @@ import pytest
 from pebble.config import load
 from pebble.config.raw import deep_merge
 from pebble.extensions.fleet import authority, certificates
+from pebble.extensions.fleet.files import load_hub
 from pebble.extensions.fleet.folder import FLEET, ZENOH
 from pebble.extensions.fleet.hub_access import read_access
-from pebble.extensions.fleet.hub_file import load_hub
 from pebble.extensions.fleet.people import People
 from pebble.extensions.fleet.robot_audit import ROBOT, files
 from pebble.extensions.fleet.roles import Role

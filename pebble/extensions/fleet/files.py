@@ -1,20 +1,22 @@
-"""The file of ``pebble fleet gateway``: the robots' hub, the operators' MQTT broker, which robots to carry; and the
-connections that it asks for.
-"""
+"""The files of ``pebble fleet hub`` and ``pebble fleet gateway``, and the connections that a gateway's asks for."""
 
 import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
+
+from msgspec import Meta
 
 from pebble import contract as c
 from pebble.config.config import default_run_folder
 from pebble.config.problems import Notes
 from pebble.config.raw import decode, plain, read_text
-from pebble.config.reader import Reader
+from pebble.config.reader import Reader, Rule, S
 from pebble.config.rules.between_keys import CHECKS
 from pebble.config.rules.doors import place_of
 from pebble.config.transport import Mqtt, ZenohSection
-from pebble.config.types import EMPTY, Account, Level, Section, doc
+from pebble.config.types import EMPTY, Account, CommonName, File, Level, Section, doc
 from pebble.contract.identity import GATEWAYS, SERVERS, Identity
 from pebble.errors import ConfigError
 from pebble.runtime.connections import (
@@ -23,11 +25,28 @@ from pebble.runtime.connections import (
     client_of_hub,
     live_only,
     mqtt_settings,
+    tls_settings,
 )
 from pebble.services.neighbours.config import RULES, Neighbours
-from pebble.transports import Message, Transport, create
+from pebble.transports import Message, Transport, ZenohSettings, create
 
 MOST_BOARDS = 16  # of one file that have neighbours: each has two connections and a thread
+
+
+class HubFile(ZenohSection, frozen=True, kw_only=True):
+    """A hub: the addresses where it listens, and the Zenoh routers that it connects to."""
+
+    run_dir: Annotated[File | None, doc("Folder of its socket and lock; unset: one of its own.")] = None
+    journal: Annotated[File | None, doc("File for what it retains; unset: memory only.")] = None
+    access: Annotated[
+        File | None, doc("File of `pebble fleet zenoh`: what each name of a certificate may do there.")
+    ] = None
+    allowed_names: Annotated[
+        tuple[CommonName, ...] | None, doc("Without access: names (CN) of the certificates that may connect.")
+    ] = None
+    max_wills: Annotated[
+        int, Meta(ge=1, le=1_000_000, description="Clients that may leave a will: a robot has one or two.")
+    ] = 1000
 
 
 class GatewayHub(ZenohSection, frozen=True, kw_only=True):
@@ -65,30 +84,56 @@ class GatewayFile(Section, frozen=True, kw_only=True):
         return self.mqtt or (None if self.neighbours else Mqtt())
 
 
+@contextmanager
+def _read(path: Path, kind: type[S], rules: Sequence[Rule] = CHECKS) -> Iterator[tuple[S, Notes]]:
+    """Yield the content of a file, and notes of its mistakes. Raises ConfigError with all of them after the block."""
+    reader = Reader(path.parent, os.environ, rules, file=path)
+    yield reader.section(kind, plain(decode(read_text(path), path.name), reader.notes)), reader.notes
+    if reader.notes.problems:
+        raise ConfigError(list(dict.fromkeys(f"{path.name}: {problem}" for problem in reader.notes.problems)))
+
+
+def load_hub(path: Path) -> ZenohSettings:
+    """Read the file; return the settings of its hub. Raises ConfigError with all problems."""
+    path = path.absolute()
+    with _read(path, HubFile) as (hub, notes):
+        if not hub.listen:
+            notes.problem(("listen",), 'is missing: a hub is reached there, such as ["tls/0.0.0.0:7447"]')
+    return ZenohSettings(
+        run_dir=hub.run_dir or default_run_folder(f"hub {path}", os.environ),
+        listen=hub.listen,
+        connect=hub.connect,
+        tls=tls_settings(hub.tls),
+        allowed_names=hub.allowed_names,
+        access=hub.access,
+        lease_ms=hub.lease_ms,
+        journal=hub.journal,
+        max_wills=hub.max_wills,
+    )
+
+
 def load_gateway(path: Path) -> tuple[GatewayFile, str, Path]:
     """Read the file; return it with the gateway's name and its run directory.
 
     Raises ConfigError with all problems.
     """
     path = path.absolute()
-    reader = Reader(path.parent, os.environ, (*CHECKS, *RULES), file=path)
-    problem = reader.notes.problem
-    gateway = reader.section(GatewayFile, plain(decode(read_text(path), path.name), reader.notes))
-    operators = gateway.operators
-    name = gateway.id
-    if not name and operators is not None:
-        name = operators.username or ""
-    if not name:
-        problem(("id",), "is missing: write what this gateway is called, such as gate-1")
-    if not gateway.robots:
-        problem(("robots",), 'is empty: write such as ["pebble/robots/+"]')
-    for at, base in enumerate(gateway.robots):
-        if not _is_base(base):
-            problem(("robots", str(at)), f"{base!r} is no base: write SYSTEM/TYPE/ID, such as pebble/robots/+")
-    _check_sides(reader.notes, gateway, operators)
-    _check_neighbours(reader.notes, gateway)
-    if reader.notes.problems:
-        raise ConfigError(list(dict.fromkeys(f"{path.name}: {problem}" for problem in reader.notes.problems)))
+    with _read(path, GatewayFile, (*CHECKS, *RULES)) as (gateway, notes):
+        operators = gateway.operators
+        name = gateway.id
+        if not name and operators is not None:
+            name = operators.username or ""
+        if not name:
+            notes.problem(("id",), "is missing: write what this gateway is called, such as gate-1")
+        if not gateway.robots:
+            notes.problem(("robots",), 'is empty: write such as ["pebble/robots/+"]')
+        for at, base in enumerate(gateway.robots):
+            if not _is_base(base):
+                notes.problem(
+                    ("robots", str(at)), f"{base!r} is no base: write SYSTEM/TYPE/ID, such as pebble/robots/+"
+                )
+        _check_sides(notes, gateway, operators)
+        _check_neighbours(notes, gateway)
     return gateway, name, default_run_folder(f"gateway {path}", os.environ)
 
 
