@@ -119,36 +119,58 @@ def test_a_robot_that_never_answers_is_given_up_after_a_minute() -> None:
     assert stop.robots[GOOB].why == "nothing was received: it may be off"
 
 
-@pytest.mark.parametrize("owners", [[], ["a/b"], ["x"] * 17, "serial"])
-def test_a_robot_without_valid_owners_is_never_confirmed(owners: object) -> None:
-    stop, robot = sender(GOOB), Robot(GOOB, "serial", estop={"available": True, "owners": owners})
-    receive(stop, robot.capabilities(), *robot.take(stop.tick(0.0)), now=0.1)
-    assert stop.robots[GOOB].why == "its capabilities list no valid motor owners"
-    assert not stop.confirmed
+SCRIPT, ROS, FREDS = f"{GOOB}/incoming/autonomy-command", f"{GOOB}/incoming/ros/drive", f"{FRED}/incoming/drive-values"
+DRIVES, ELSEWHERE, BOTH = {"available": True}, {"available": True, "topic": "else/where"}, [ESTOP, DRIVE]
+HELD_BY_NONE = {"zeros": [ROS, 5, FREDS]}
+OLD, NO_OWNERS = "it has no emergency stop", "its capabilities list no valid motor owners"
+ZEROS, REFUSED = (
+    "it has motors that no stop can hold: they get zeros",
+    "its broker refuses emergency stops, so it gets zeros",
+)
+#: What a robot publishes after the first stop that it got, where the next two go, and why it is never confirmed.
+UNCONFIRMED: dict[str, tuple[dict[str, object], list[str], list[str], str]] = {
+    "old": ({"drive": ELSEWHERE, "autonomy": {"command_topic": "a/s"}}, ["a/s", "else/where"], ["else/where"], OLD),
+    "old, as its section is none": ({"drive": DRIVES, "estop": 5}, [SCRIPT, DRIVE], [DRIVE], OLD),
+    "with a topic of another robot": ({"drive": {"topic": FREDS}}, [SCRIPT, DRIVE], [DRIVE], OLD),
+    "with a script of another robot": ({"autonomy": {"command_topic": FREDS}}, [SCRIPT, DRIVE], [DRIVE], OLD),
+    "not driving, but named": ({"drive": {"available": False}}, [SCRIPT, DRIVE], [DRIVE], OLD),
+    "refused by its broker": ({"estop": {"available": False}}, BOTH, BOTH, REFUSED),
+    "without a stop, beside ROS": (
+        {"estop": {"available": False} | HELD_BY_NONE},
+        [ESTOP, SCRIPT, DRIVE, ROS],
+        [ESTOP, DRIVE, ROS],
+        ZEROS,
+    ),
+    "with a stop, beside ROS": (
+        {"estop": {"available": True, "owners": ["serial"]} | HELD_BY_NONE},
+        [ESTOP, SCRIPT, DRIVE, ROS],
+        [ESTOP, DRIVE, ROS],
+        ZEROS,
+    ),
+    **{
+        f"owners {owners}, topic {topic}": (
+            {"drive": {"topic": topic}, "estop": {"available": True, "owners": owners}},
+            BOTH,
+            BOTH,
+            NO_OWNERS,
+        )
+        for owners, topic in (([], None), (["a/b"], "a/#"), (["x"] * 17, 5), ("serial", ""))
+    },
+}
 
 
-@pytest.mark.parametrize("section", [{}, {"estop": 5}])
-def test_an_old_robot_gets_zeros_and_one_end_of_its_script(section: dict[str, object]) -> None:
-    stop = sender(GOOB)
-    value = {"drive": {"available": True, "topic": "else/where"}, "autonomy": {"command_topic": "a/script"}, **section}
-    receive(stop, capabilities(GOOB, value), now=0.0)
+@pytest.mark.parametrize(("value", "next_", "later", "why"), UNCONFIRMED.values(), ids=UNCONFIRMED)
+def test_what_cannot_confirm_a_stop_gets_it_or_zeros_for_a_minute(
+    value: dict[str, object], next_: list[str], later: list[str], why: str
+) -> None:
+    stop, robot = sender(GOOB), Robot(GOOB, "serial")
     first = stop.tick(0.0)
-    assert topics(first) == ["a/script", "else/where"]
-    assert first[0].payload == b'{"action":"stop"}'
-    assert topics(stop.tick(0.5)) == ["else/where"]
-    assert stop.robots[GOOB].progress is Progress.OLD
-    assert sent_times(stop, 100.0)[-1] == 59.5
-    assert (stop.finished, stop.confirmed, stop.robots[GOOB].progress) == (True, False, Progress.OLD)
-
-
-def test_zeros_and_ends_of_scripts_go_to_no_other_robot() -> None:
-    stop = sender(GOOB)
-    value = {
-        "drive": {"available": True, "topic": "pebble/robots/fred/incoming/drive-values"},
-        "autonomy": {"command_topic": "pebble/robots/goob2/incoming/autonomy-command"},
-    }
-    receive(stop, capabilities(GOOB, value), now=0.0)
-    assert topics(stop.tick(0.0)) == [f"{GOOB}/incoming/autonomy-command", f"{GOOB}/incoming/drive-values"]
+    receive(stop, capabilities(GOOB, value), *robot.take(first), now=0.1)
+    assert [topics(first), topics(stop.tick(0.6)), topics(stop.tick(1.1))] == [[ESTOP, DRIVE], next_, later]
+    assert stop.robots[GOOB].why == why
+    assert sent_times(stop, 100.0)[-1] == pytest.approx(59.6)
+    assert stop.robots[GOOB].progress is (Progress.OLD if why == OLD else Progress.NOT_CONFIRMED)
+    assert (stop.finished, stop.confirmed) == (True, False)
 
 
 @pytest.mark.parametrize(
@@ -160,29 +182,12 @@ def test_a_page_sends_zeros_to_incoming_topics_of_that_robot_only(topic: str, *,
     assert (topic in topics(stop.tick(0.0))) is sent
 
 
-def test_a_robot_whose_broker_refuses_stops_gets_them_and_zeros_and_is_not_old() -> None:
-    stop = sender(GOOB)
-    receive(stop, capabilities(GOOB, {"drive": {"available": True}, "estop": {"available": False}}), now=0.0)
-    assert topics(stop.tick(0.0)) == topics(stop.tick(0.5)) == [ESTOP, DRIVE]
-    assert stop.robots[GOOB].progress is Progress.WAITING
-    assert stop.robots[GOOB].why == "its broker refuses emergency stops, so it gets zeros"
-    assert sent_times(stop, 100.0)[-1] == 59.5
-    assert stop.robots[GOOB].progress is Progress.NOT_CONFIRMED
-
-
 def test_capabilities_that_arrive_later_lead_to_the_right_topic_at_once() -> None:
     stop, robot = sender(GOOB), Robot(GOOB, "serial", drive={"topic": "else/where"})
     assert topics(stop.tick(0.0)) == [ESTOP, DRIVE]
     receive(stop, robot.capabilities(), now=0.05)
     assert stop.due == 0.05
     assert topics(stop.tick(0.05)) == [ESTOP, "else/where"]
-
-
-@pytest.mark.parametrize("topic", ["a/#", 5])
-def test_a_topic_that_cannot_be_published_to_is_not_used(topic: object) -> None:
-    stop, robot = sender(GOOB), Robot(GOOB, "serial", drive={"topic": topic})
-    receive(stop, robot.capabilities(), now=0.0)
-    assert topics(stop.tick(0.0)) == [ESTOP, DRIVE]
 
 
 def test_a_robot_that_is_reset_on_purpose_stays_free() -> None:
@@ -192,14 +197,6 @@ def test_a_robot_that_is_reset_on_purpose_stays_free() -> None:
     assert latch.reset(latch.boot, latch.count, 0, 0)
     receive(stop, robot.owners[0].state(), now=0.2)
     assert topics(stop.tick(0.5)) == [f"{FRED}/incoming/estop", f"{FRED}/incoming/drive-values"]
-
-
-def test_a_person_may_end_it() -> None:
-    stop = sender(GOOB, hold=True)
-    stop.tick(0.0)
-    stop.end()
-    assert (stop.finished, stop.due, stop.tick(0.5)) == (True, None, [])
-    assert stop.robots[GOOB].progress is Progress.NOT_CONFIRMED
 
 
 #: What may wrongly be taken for something that does not drive, and how often a stop of all is sent to it in 2 s.
@@ -227,21 +224,6 @@ def test_a_stop_of_all_reaches_what_may_move(message: Message, times: int) -> No
     base = message.topic.partition("/outgoing/")[0]
     sent = [topics(stop.tick(now)) for now in (0.0, 0.5, 1.0, 1.5)]
     assert sum(f"{base}/incoming/drive-values" in some for some in sent) == times
-
-
-@pytest.mark.parametrize("owners", [[], ["serial"]])
-def test_what_no_stop_can_hold_gets_zeros_for_a_minute_and_is_never_confirmed(owners: list[str]) -> None:
-    ros = f"{GOOB}/incoming/ros/drive"
-    section = {
-        "available": bool(owners),
-        "owners": owners,
-        "zeros": [ros, 5, "pebble/robots/fred/incoming/drive-values"],
-    }
-    stop, robot = sender(GOOB), Robot(GOOB, *owners, estop=section)
-    receive(stop, robot.capabilities(), *robot.take(stop.tick(0.0)), now=0.1)
-    assert topics(stop.tick(0.5)) == [ESTOP, f"{GOOB}/incoming/autonomy-command", DRIVE, ros]
-    assert stop.robots[GOOB].why == "it has motors that no stop can hold: they get zeros"
-    assert (sent_times(stop, 100.0)[-1], stop.robots[GOOB].progress) == (59.5, Progress.NOT_CONFIRMED)
 
 
 def test_named_robots_are_all_stopped_however_many() -> None:
@@ -292,12 +274,6 @@ def test_a_component_that_does_not_drive_is_spared_once_that_is_known() -> None:
     assert topics(stop.tick(0.6)) == [f"{FRED}/incoming/autonomy-command", f"{FRED}/incoming/drive-values"]
     assert (stop.tick(1.2), stop.robots[FRED].progress) == ([], Progress.SPARED)
     assert not stop.confirmed, "no robot was stopped"
-
-
-def test_a_named_robot_is_never_spared() -> None:
-    stop = sender(GOOB)
-    receive(stop, capabilities(GOOB, {"drive": {"available": False}}), now=0.0)
-    assert topics(stop.tick(0.0)) == [f"{GOOB}/incoming/autonomy-command", DRIVE]
 
 
 @pytest.mark.parametrize(
@@ -366,12 +342,16 @@ def test_robots_without_a_place_get_the_stop_for_a_minute_however_many() -> None
     assert (sent, stop.finished) == ([False, True, False, True, False], True)
 
 
-def test_a_stop_that_is_ended_goes_to_no_robot_without_a_place(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(estop, "MAX_ROBOTS", 0)
-    stop = sender()
+@pytest.mark.parametrize("places", [0, 1])
+def test_a_stop_that_is_ended_goes_to_no_robot_also_without_a_place(
+    monkeypatch: pytest.MonkeyPatch, places: int
+) -> None:
+    monkeypatch.setattr(estop, "MAX_ROBOTS", places)
+    stop = sender(hold=True)
     publish_quietly(stop, GOOB, [HEARTBEAT], 0.0)
     stop.end()
-    assert stop.tick(0.0) == []
+    assert (stop.finished, stop.due, stop.tick(0.5)) == (True, None, [])
+    assert [robot.progress for robot in stop.robots.values()] == [Progress.NOT_CONFIRMED] * places
 
 
 def test_robots_that_the_caller_knows_are_stopped_unheard_and_confirm_it_in_a_crowd() -> None:
