@@ -19,6 +19,7 @@ from tests.services.mqtt_bridge.bridge_rig import BASE, make_config
 SUBJECTS = Subjects(make_config())
 NAMES = {strangers: CheckedNames(BASE, SUBJECTS, strangers) for strangers in ("drive", "free", "refuse")}
 KEYED = '{"x":0,"z":0.5,"key":"0badf00d"%s}'
+DEEP = b'{"a":' * 3000 + b"{}" + b"}" * 3000
 MOVE, ZERO = b'{"x":0,"z":0.5}', b'{"x":0,"z":0}'
 
 
@@ -66,7 +67,7 @@ class TestSign:
         )  # fmt: skip
 
     @pytest.mark.parametrize("channel", [one for one in CHANNELS if one.direction == INCOMING])
-    @pytest.mark.parametrize("payload", [b"true", b"[]", b"", b"{", b"{}garbage", b'{"a":1}\xff'])
+    @pytest.mark.parametrize("payload", [b"true", b"[]", b"", b"{", b"{}garbage", b'{"a":1}\xff', DEEP])
     def test_what_no_reader_takes_for_an_object_does_not_pass_as_one(self, channel: Channel, payload: bytes) -> None:
         """What would pass without a name in it is either no object for any reader, or refused by all of them."""
         found = sign(f"by/ann/{channel.metric.replace('{', '').replace('}', '')}", payload)
@@ -81,10 +82,6 @@ class TestSign:
             b'{"z":1,"by":"ann"}', b'{"by":"ann"}'
         }  # fmt: skip
         assert sign("by/ann/group", b'{"lights-solid": {"r": 1}, ' + lights) is Drop.UNREADABLE
-
-    def test_what_is_nested_too_deep_takes_no_name(self) -> None:
-        deep = b'{"a":' * 3000 + b"{}" + b"}" * 3000
-        assert sign("by/ann/drive-values", deep.ljust(300)) is Drop.UNREADABLE
 
     @pytest.mark.parametrize("suffix", ["drive-values", "flags/mqtt-video"])
     @pytest.mark.parametrize("flag", ["retain", "retain_requested"])
@@ -135,17 +132,20 @@ class TestWithoutName:
 
 class TestTopics:
     @pytest.mark.parametrize(
-        "suffix",
-        ["by/ann/by/otto/drive-values", "by/Ann/drive-values", "by/-/drive-values", "by/estop", "by/ann/"],
+        ("topic", "foreign"),
+        [
+            *(
+                (f"{BASE}/incoming/by/{one}", Drop.MISNAMED)
+                for one in ("ann/by/otto/x", "Ann/x", "-/x", "estop", "ann/")
+            ),
+            *((topic, Drop.FOREIGN) for topic in ("pebble/robots/other/incoming/by/ann/estop", f"{BASE}/x")),
+        ],
     )
-    def test_a_name_that_no_account_can_have_is_none(self, suffix: str) -> None:
-        sender = NAMES["drive"][f"{BASE}/incoming/{suffix}"]
-        assert (sender.account, sender.subject, sender.foreign) == ("-", None, Drop.MISNAMED)
-
-    @pytest.mark.parametrize("topic", ["pebble/robots/other/incoming/by/ann/estop", "pebble/robots/rover/x"])
-    def test_other_topics_are_not_this_robots(self, topic: str) -> None:
+    def test_a_name_that_no_account_can_have_is_none_and_other_topics_are_not_this_robots(
+        self, topic: str, foreign: Drop
+    ) -> None:
         sender = NAMES["drive"][topic]
-        assert (sender.subject, sender.foreign) == (None, Drop.FOREIGN)
+        assert (sender.account, sender.subject, sender.foreign) == ("-", None, foreign)
 
     def test_what_is_remembered_of_invented_topics_is_bounded(self) -> None:
         names = CheckedNames(BASE, SUBJECTS, "refuse")

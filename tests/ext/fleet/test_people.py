@@ -44,9 +44,6 @@ def test_rights_of_each_role() -> None:
         "safety": ["drive", "reset", "take"],
         "admin": ["drive", "people", "reset", "system", "take"],
     }
-
-
-def test_where_names_are_checked_only_safety_and_admin_reset() -> None:
     assert [role.value for role in Role if "reset" in page_rights(role, "named")] == ["safety", "admin"]
 
 
@@ -169,7 +166,7 @@ def test_names_are_unique_and_must_exist(people: People) -> None:
     assert people.list() == [User("alice", Role.DRIVER)]
 
 
-def test_a_session_starts_and_ends(people: People) -> None:
+def test_a_session_starts_ends_and_expires(people: People, clock: Clock) -> None:
     token = people.start_session(User("alice", Role.DRIVER))
     session = people.session(token)
     assert session is not None
@@ -180,19 +177,16 @@ def test_a_session_starts_and_ends(people: People) -> None:
     assert (changed and changed.role) == Role.VIEWER
     people.end_session(token)
     assert people.session(token) is None
+    token = people.start_session(User("alice", Role.DRIVER))
+    clock.now += SESSION_S - 1
+    assert people.session(token) is not None
+    clock.now += 1
+    assert people.session(token) is None
 
 
 @pytest.mark.parametrize("token", ["", "\ud800", "' OR 1=1 --", "x" * 100_000])
 def test_no_other_token_is_a_session(people: People, token: str) -> None:
     people.start_session(User("alice", Role.DRIVER))
-    assert people.session(token) is None
-
-
-def test_a_session_expires(people: People, clock: Clock) -> None:
-    token = people.start_session(User("alice", Role.DRIVER))
-    clock.now += SESSION_S - 1
-    assert people.session(token) is not None
-    clock.now += 1
     assert people.session(token) is None
 
 

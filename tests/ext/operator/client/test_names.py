@@ -11,7 +11,7 @@ import pytest
 from pebble.errors import PebbleError
 from pebble.extensions.operator.client.named_topics import NamedTopics
 from pebble.extensions.operator.client.names import Names, base_of
-from pebble.extensions.operator.client.url import UrlError, settings_of
+from pebble.extensions.operator.client.url import UrlError, password, settings_of
 from pebble.runtime.connections import ALL_VITAL
 from pebble.transports import Message, MqttSettings, QoS, ZenohSettings
 
@@ -33,12 +33,8 @@ def test_names_to_listen_to(name: str, filters: list[str]) -> None:
     assert Names(GOOB).filters(name) == filters
 
 
-@pytest.mark.parametrize("typed", ["bär", "ba\u0308r", "pebble/robots/ba\u0308r"])
-def test_an_id_is_typed_in_one_form(typed: str) -> None:
-    assert base_of(typed) == "pebble/robots/b\u00e4r"
-
-
-def test_names_to_publish_to() -> None:
+def test_an_id_is_typed_in_any_form_and_names_one_topic_to_publish_to() -> None:
+    assert {base_of(typed) for typed in ("bär", "ba\u0308r", "pebble/robots/ba\u0308r")} == {"pebble/robots/b\u00e4r"}
     names = Names(base_of("goob"))
     assert names.topic("audio") == f"{GOOB}/incoming/audio"
     assert names.topic("outgoing/audio") == f"{GOOB}/outgoing/audio"
@@ -143,6 +139,12 @@ def test_encrypted_urls_and_run_directories(tmp_path: Path) -> None:
     assert settings.tls is not None
     assert settings.tls.ca_cert == tmp_path / "ca.pem"
     assert settings_of(f"zenoh:{tmp_path}") == ("zenoh", ZenohSettings(run_dir=tmp_path, client=True))
+
+
+def test_a_password_comes_from_a_file_or_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "right").write_text("geheim\n")
+    monkeypatch.setenv("PEBBLE_PASSWORD", "of all")
+    assert [password(file) for file in (tmp_path / "right", None)] == ["geheim", "of all"]
 
 
 @pytest.mark.parametrize("url", ["mqtts://:geheim@broker", "mqtt://ann:geheim@broker:x"])

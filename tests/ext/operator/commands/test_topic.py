@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import json
 import signal
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -82,24 +81,6 @@ def test_a_robot_is_found_however_its_accents_are_spelled(run: Run, broker: Brok
         for metric in ("capabilities", "estop/serial"):
             robot.remove(metric)
         robot.close()
-
-
-def test_a_password_comes_from_a_file_or_the_environment(
-    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    passwords = tmp_path / "passwords"
-    subprocess.run(["mosquitto_passwd", "-b", "-c", str(passwords), "ann", "geheim"], check=True, capture_output=True)
-    passwords.chmod(0o644)
-    broker = Broker(tmp_path, "allow_anonymous false", f"password_file {passwords}")
-    (tmp_path / "right").write_text("geheim\n")
-    url = f"mqtt://ann@127.0.0.1:{broker.port}"
-    pub = ("topic", "pub", "status", "{}", "--robot", "goob", "--url", url)
-    try:
-        assert run(*pub, "--password-file", tmp_path / "right") == 0
-        monkeypatch.setenv("PEBBLE_PASSWORD", "geheim")
-        assert run(*pub) == 0
-    finally:
-        broker.stop()
 
 
 # -- the contract
