@@ -23,7 +23,7 @@ from pebble.extensions.fleet import certificates
 from pebble.extensions.fleet.folder import FLEET, Fleet, FleetError, load
 from pebble.extensions.fleet.roles import ProgramRole, Right, rights
 from pebble.extensions.operator.client.page_packages import require_packages
-from pebble.extensions.operator.running import launcher_runs
+from pebble.extensions.operator.places import launcher_runs
 from pebble.extensions.page.config import WebHandler, WebInterface
 from pebble.extensions.page.setting import settings_of
 from pebble.runtime.connections import REMOTE_RECONNECT_S, mqtt_settings

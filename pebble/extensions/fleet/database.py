@@ -3,7 +3,7 @@
 import errno
 import os
 import sqlite3
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -29,12 +29,10 @@ class Database:
 
     ``path`` None: in memory. If the file is removed or replaced, the connection continues with the file that it opened.
     A new file, and what SQLite writes beside it, is readable only by its owner. Raises PebbleError if it cannot be
-    opened; ``upgrade`` changes the tables of older versions.
+    opened.
     """
 
-    def __init__(
-        self, path: Path | None, tables: str, upgrade: Callable[[sqlite3.Connection], None] = lambda _connection: None
-    ) -> None:
+    def __init__(self, path: Path | None, tables: str) -> None:
         self._path = path
         if path is not None:
             require_own(path.parent)
@@ -53,7 +51,6 @@ class Database:
             self._connection.execute("PRAGMA synchronous = NORMAL")
             self._connection.execute("PRAGMA foreign_keys = ON")
             self._connection.executescript(tables)
-            upgrade(self._connection)
             self._own = None if path is None else OwnFile(path)
         except (OSError, sqlite3.Error) as error:
             why = DatabaseError(path, error).why.replace("is locked", "is locked, or its file system has no locks")

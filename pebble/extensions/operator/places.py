@@ -1,9 +1,13 @@
-"""The paths of an installed robot's files, and of the machine's mosquitto."""
+"""The paths of an installed robot's files, and of the machine's mosquitto; and whether a robot runs here."""
 
+import os
 import shutil
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+
+from pebble.config import LAUNCHER_LOCK
+from pebble.ownership import read_plain
 
 SBIN = "/usr/local/sbin:/usr/sbin:/sbin"  # where Debian puts brokers and network tools, not in the PATH of users
 
@@ -76,3 +80,13 @@ class Places:
 def mosquitto_path() -> str | None:
     """Return the path of mosquitto; None if it is not installed."""
     return shutil.which("mosquitto") or shutil.which("mosquitto", path=SBIN)
+
+
+def launcher_runs(run_dir: Path) -> bool:
+    """True if the last started launcher of this run directory is still running."""
+    try:
+        pid = int(read_plain(run_dir / LAUNCHER_LOCK).partition(b"\n")[0])
+        os.kill(pid, 0)
+    except (OSError, ValueError, OverflowError):
+        return False
+    return True

@@ -14,7 +14,7 @@ import msgspec
 from pebble.config import Config, load
 from pebble.contract.payloads import LAST_RUN, LONGEST_SUMMARY, MOST_MAIN
 from pebble.errors import ConfigError, PebbleError, TransportError
-from pebble.extensions.operator.running import launcher_runs
+from pebble.extensions.operator.places import launcher_runs
 from pebble.extensions.scripts.runs import CONFIG, RUN, LocalScriptsLock, next_run
 from pebble.extensions.scripts.script.guard import END_S, Guard
 from pebble.extensions.scripts.script.options import OneLineParser, form, parse
