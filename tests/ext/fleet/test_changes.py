@@ -251,6 +251,8 @@ def test_a_fleet_of_the_plugin_becomes_one_of_files(tmp_path: Path, run: Run, mo
         ("x", Account(roles=("robot",), bases=("goob",)), "is no base"),
         ("x", Account(roles=("robot",), bases=("pebble/servers/x",)), "servers are no robots"),
         ("x", Account(roles=("gateway",), bases=("pebble/robots",)), "is no base"),
+        ("x", Account(roles=("neighbour",), bases=("pebble/robots/goob",)), "belongs to goob-lan"),
+        ("x", Account(roles=("neighbour",), bases=("pebble/robots/fred",)), ""),
         ("x", Account(roles=("driver", "safety")), ""),
         ("x", Account(roles=("gateway",), bases=("pebble/robots/+",)), ""),
         ("x", Account(roles=("boards",), bases=("pebble/robots/minilamp", "pebble/robots/benjr")), ""),
@@ -259,7 +261,8 @@ def test_a_fleet_of_the_plugin_becomes_one_of_files(tmp_path: Path, run: Run, mo
     ids=str,
 )
 def test_who_may_be_added(tmp_path: Path, name: str, account: Account, why: str) -> None:
-    broker = FleetBroker(tmp_path / "hall", {"otto": DRIVER, "goob": GOOB})
+    lan = Account(roles=("neighbour",), bases=GOOB.bases)
+    broker = FleetBroker(tmp_path / "hall", {"otto": DRIVER, "goob": GOOB, "goob-lan": lan})
     assert why in refused(broker.fleet, name, account)
     assert bool(why) == bool(refused(broker.fleet, name, account))
 
