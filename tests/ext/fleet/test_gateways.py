@@ -150,68 +150,51 @@ GRANT = {"shares": [ONLINE.metric], "commanded": {"goob": [DRIVE.metric]}}
 _RUNS = itertools.count(7)  # the gateway's state has each that has begun, as long as this process
 
 
-class Lan(Gateways):
-    """The broker of a LAN with its board, and a gateway."""
-
-    def __init__(self, folder: Path, stack: ExitStack) -> None:
-        super().__init__(folder, stack)
-        near = Broker(folder)
+def test_a_board_is_driven_by_a_neighbour_until_a_person_does() -> None:
+    with tempfile.TemporaryDirectory(prefix="pbl") as name, ExitStack() as stack:
+        folder, received = Path(name), list[Message]()
+        lan, near = Gateways(folder, stack), Broker(folder)
         stack.callback(near.kill)
-        neighbours = {LAMP: {"lan": {"connect": [self.endpoint]}, **GRANT}}
-        self.gateway = self.start("gate-1", boards={"host": "127.0.0.1", "port": near.port}, neighbours=neighbours)
-        self.board = stack.enter_context(Robots(near.port, kinds=("minilamp",)))
-        client = self.client("goob-lan")
-        self.goob = One(folder / "goob", client, "goob", stack, listens={"minilamp": [ONLINE.metric]})
-        self.received: list[Message] = []
-        self.operator.subscribe(f"{LAMP}/outgoing/#", self.received.append, direct=True)
+        neighbours = {LAMP: {"lan": {"connect": [lan.endpoint]}, **GRANT}}
+        gateway_ = lan.start("gate-1", boards={"host": "127.0.0.1", "port": near.port}, neighbours=neighbours)
+        board = stack.enter_context(Robots(near.port, kinds=("minilamp",)))
+        goob = One(folder / "goob", lan.client("goob-lan"), "goob", stack, listens={"minilamp": [ONLINE.metric]})
+        lan.operator.subscribe(f"{LAMP}/outgoing/#", received.append, direct=True)
 
-    def script(self) -> Robot:
-        """A new start of a script of goob's."""
-        run = next(_RUNS)
-        robot = Robot(self.goob.config, MemoryTransport(f"script-{run}", self.goob.hub).open(), lambda _above: run)
-        self._stack.callback(robot.close)
-        assert until(lambda: robot.neighbour("minilamp").online)
-        return robot
+        def newest(metric: str) -> dict[str, object]:
+            found = [one.payload for one in list(received) if one.topic == f"{LAMP}/outgoing/{metric}"]
+            return json.loads(found[-1]) if found else {}
 
-    def drives(self, robot: Robot, seconds: float) -> bool:
-        """Let it drive the board for so long; whether its motors ran."""
-        began = time.monotonic()
-        while time.monotonic() < began + seconds:
-            robot.neighbour("minilamp").drive(z=0.4)
-            time.sleep(0.05)
-        return any(at > began and any(motors) for at, motors in list(self.board.moves["minilamp"]))
+        def started() -> Robot:
+            """A new start of a script of goob's."""
+            run = next(_RUNS)
+            robot = Robot(goob.config, MemoryTransport(f"script-{run}", goob.hub).open(), lambda _above: run)
+            stack.callback(robot.close)
+            assert until(lambda: robot.neighbour("minilamp").online)
+            return robot
 
-    def send(self, topic: str, payload: dict[str, object]) -> None:
-        self.operator.publish(topic, json.dumps(payload).encode(), qos=QoS.DELIVERED)
+        def drives(robot: Robot, seconds: float) -> bool:
+            """Let it drive the board for so long; whether its motors ran."""
+            began = time.monotonic()
+            while time.monotonic() < began + seconds:
+                robot.neighbour("minilamp").drive(z=0.4)
+                time.sleep(0.05)
+            return any(at > began and any(motors) for at, motors in list(board.moves["minilamp"]))
 
-    def newest(self, metric: str) -> dict[str, object]:
-        found = [one.payload for one in list(self.received) if one.topic == f"{LAMP}/outgoing/{metric}"]
-        return json.loads(found[-1]) if found else {}
-
-
-@pytest.fixture
-def lan() -> Iterator[Lan]:
-    with tempfile.TemporaryDirectory(prefix="pbl") as folder, ExitStack() as stack:
-        made = Lan(Path(folder), stack)
-        made.board.wait_online()
-        topics = (ONLINE.topic(LAMP), CAPABILITIES.topic(LAMP), f"{LAMP}/outgoing/neighbours")
-        assert until(lambda: {*topics} <= {one.topic for one in list(made.received)}), made.gateway.printed
-        yield made
-
-
-def test_a_board_is_driven_by_a_neighbour_until_a_person_does(lan: Lan) -> None:
-    robot = lan.script()
-    lamp = robot.neighbour("minilamp")
-    assert until(lambda: lamp.latest(ONLINE) is not None), "goob receives what it shares"
-    assert until(lambda: lan.drives(robot, 0.3))
-    assert until(lambda: lan.newest("neighbours")["driven_by"] == "goob")
-    lan.send(DRIVE.topic(LAMP), {"x": 0, "z": 0})
-    assert until(lambda: lamp.why_refused)
-    assert until(lambda: not lan.board.moving("minilamp"), SOON_S)
-    assert not lan.drives(robot, 0.5), "a person has ended its run"
-    time.sleep(2.0)  # which holds for this long
-    again = lan.script()
-    assert until(lambda: lan.drives(again, 0.3)), "a new start drives"
-    lan.send(ESTOP.topic(LAMP), {"stop": "s" * 16, "by": "ann"})
-    assert until(lambda: lan.newest("estop/mcu").get("latched")), "the operators' stop"
-    assert not lan.drives(again, 0.5)
+        board.wait_online()
+        assert until(lambda: all(map(newest, ("online", "capabilities", "neighbours")))), gateway_.printed
+        robot = started()
+        lamp = robot.neighbour("minilamp")
+        assert until(lambda: lamp.latest(ONLINE) is not None), "goob receives what it shares"
+        assert until(lambda: drives(robot, 0.3))
+        assert until(lambda: newest("neighbours")["driven_by"] == "goob")
+        lan.operator.publish(DRIVE.topic(LAMP), b'{"x": 0, "z": 0}', qos=QoS.DELIVERED)
+        assert until(lambda: lamp.why_refused)
+        assert until(lambda: not board.moving("minilamp"), SOON_S)
+        assert not drives(robot, 0.5), "a person has ended its run"
+        time.sleep(2.0)  # which holds for this long
+        again = started()
+        assert until(lambda: drives(again, 0.3)), "a new start drives"
+        lan.operator.publish(ESTOP.topic(LAMP), b'{"stop": "ssssssssssssssss", "by": "ann"}', qos=QoS.DELIVERED)
+        assert until(lambda: newest("estop/mcu").get("latched")), "the operators' stop"
+        assert not drives(again, 0.5)
