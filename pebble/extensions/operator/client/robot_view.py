@@ -237,6 +237,10 @@ class RobotView:
         return self.liveness.received_at is not None
 
     @property
+    def transport(self) -> str:
+        return str(section_of(self.capabilities, "transport").get("kind", "?"))
+
+    @property
     def latched(self) -> bool:
         """True if any of the robot's motor owners is stopped by an emergency stop: it must not be driven."""
         return bool(self.estop.latched)

@@ -106,7 +106,7 @@ def test_topics_of_another_robot_in_capabilities_are_not_used() -> None:
 )
 def test_only_what_a_robot_offers_is_assumed_of_it(drive: dict[str, object], drives: bool, arbitrates: bool) -> None:
     discovery = Discovery()
-    value = {"drive": drive}
+    value = {"drive": drive, "transport": {"kind": "zenoh"}}
     publish(discovery, "capabilities", {"schema": "pebble-capabilities/v1", "t": 1, "value": value}, retain=True)
     publish(discovery, "autonomy-status", {"timestamp": 1, "running": True})
     publish(discovery, "charging-level", {"value": 7.4})
@@ -115,7 +115,7 @@ def test_only_what_a_robot_offers_is_assumed_of_it(drive: dict[str, object], dri
     seen = publish_heartbeats(discovery).situation(1.9)
     assert (seen.drives, seen.arbitrates, seen.script, seen.online) == (drives, arbitrates, True, True)
     robot = discovery.robots[BASE]
-    assert robot.volts == 7.4
+    assert (robot.transport, robot.volts) == ("zenoh", 7.4)
     assert (robot.liveness.online(0.9), robot.liveness.online(1.01)) == (True, False)
     assert robot.online(2.1) is False, "people are told after 1.5 s"
     publish(discovery, "online", {"t": int(WALL * 1000), "online": False}, now=0.6)
