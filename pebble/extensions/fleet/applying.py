@@ -3,12 +3,16 @@
 Also finds what differs between table and files, and certificates that expire soon.
 """
 
+import json
 import os
 import signal
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
+
+from msgspec.structs import replace
 
 from pebble.extensions.fleet import broker_files, certificates
 from pebble.extensions.fleet.folder import ACL, CONF, PASSWORDS, PID, ZENOH, Fleet, FleetError, Server, save
@@ -17,7 +21,7 @@ from pebble.runtime.as_owner import as_before
 from pebble.runtime.whole_file import is_root, set_mode, write
 
 _LOOPBACK = "127.0.0.1"
-_PLUGIN = "dynamic_security"  # in the name of its library
+_PLUGIN, _SECURITY = "dynamic_security", "dynamic-security.json"  # in the name of its library; its file
 _STARTING_S = 3.0  # a small board loads many accounts
 _SOON_DAYS = 30  # before a certificate ends
 
@@ -235,3 +239,44 @@ def _of_passwords(folder: Path, fleet: Fleet) -> Iterator[str]:
     stored = passwords_of(folder)
     yield from (f"{name}: an account too many: the broker lets it in" for name in stored.keys() - fleet.accounts)
     yield from (f"{name}: has no password: `pebble fleet password {name}`" for name in fleet.accounts - stored.keys())
+
+
+# -- a fleet that an earlier version made for mosquitto's dynamic-security plugin
+
+
+def convert(folder: Path, fleet: Fleet) -> tuple[Fleet, list[str]]:
+    """Write the plugin's passwords, and the access rules of ``fleet``, as files, and save the fleet.
+
+    Return the fleet as saved, and a line for each account that was left out. Raises FleetError. The plugin's own file
+    stays; mosquitto uses it until its configuration is changed.
+    """
+    file = folder / _SECURITY
+    try:
+        clients = {client["username"]: client for client in json.loads(read_plain(file))["clients"]}
+    except OSError as error:
+        raise FleetError(f"{file}: {error.strerror}") from None
+    except (ValueError, KeyError, TypeError):
+        raise FleetError(f"{file} is no file of the dynamic-security plugin: restore it from a copy") from None
+    after = replace(fleet, rules="files")
+    hashed = {
+        name: broker_files.Hashed(client["salt"], client["password"], client["iterations"])
+        for name, client in clients.items()
+        if _gets_in(name, client)
+    }
+    write_rules(folder, after, hashed)
+    save(folder, after)
+    return after, list(_left_out(fleet, clients))
+
+
+def _left_out(fleet: Fleet, clients: dict[str, dict[str, Any]]) -> Iterator[str]:
+    for name in sorted(clients.keys() - fleet.accounts.keys()):
+        yield f"{name}: is an account of the plugin that fleet.json does not have: left out"
+    for name in fleet.accounts:
+        if not _gets_in(name, clients.get(name, {})):
+            yield f"{name}: has no password that is valid at the plugin: `pebble fleet password {name}` gives a new one"
+
+
+def _gets_in(name: str, client: dict[str, Any]) -> bool:
+    """True if the plugin accepts this account's login and has its role, and the password has the form of our files."""
+    has_role = any(role.get("rolename") == f"account-{name}" for role in client.get("roles", ()))
+    return has_role and not client.get("disabled") and all(map(client.get, ("salt", "password", "iterations")))

@@ -61,7 +61,7 @@ def gateway(
     typer.echo(
         f"gateway {name} between {', '.join(near)} and {', '.join(dict.fromkeys(far))}; Ctrl-C ends it", err=True
     )
-    return _Together(programs).run(Notifier().ready)
+    return _run_together(programs, Notifier().ready)
 
 
 class _Program(Protocol):
@@ -70,33 +70,29 @@ class _Program(Protocol):
     def quit(self) -> None: ...
 
 
-class _Together:
-    """Programs that end together, at a signal or when one of them fails."""
+def _run_together(programs: list[_Program], ready: Callable[[], None]) -> int:
+    """Run programs until a signal, or until one of them ends; return the exit code: 1 if one has failed."""
+    ends, failed = EndSignal(), threading.Event()
 
-    def __init__(self, programs: list[_Program]) -> None:
-        self._programs, self._failed = programs, False
-
-    def run(self, ready: Callable[[], None]) -> int:
-        ends = EndSignal()
-        threads = [threading.Thread(target=self._run, args=(program, ends)) for program in self._programs]
-        for thread in threads:
-            thread.start()
-        ready()
-        ends.wait()
-        for program in self._programs:
-            program.quit()
-        for thread in threads:
-            thread.join()
-        return int(self._failed)
-
-    def _run(self, program: _Program, ends: EndSignal) -> None:
+    def run(program: _Program) -> None:
         try:
             program.run()
         except PebbleError as error:
             log.error("%s", error)
-            self._failed = True
+            failed.set()
         except Exception:  # the process boundary: its manager starts it again
             log.exception("%s has failed", type(program).__name__)
-            self._failed = True
+            failed.set()
         finally:
             ends.set()
+
+    threads = [threading.Thread(target=run, args=(program,)) for program in programs]
+    for thread in threads:
+        thread.start()
+    ready()
+    ends.wait()
+    for program in programs:
+        program.quit()
+    for thread in threads:
+        thread.join()
+    return int(failed.is_set())

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from pebble.config.visible import shown
 from pebble.errors import PebbleError
-from pebble.extensions.fleet import applying, certificates, folder, pieces, plugin
+from pebble.extensions.fleet import applying, certificates, folder, pieces
 from pebble.extensions.fleet.broker_files import new_password
 from pebble.extensions.fleet.commands import lan
 from pebble.extensions.fleet.commands.lan import LAZY_MODULES
@@ -280,7 +280,7 @@ def apply_(folder_: _Folder = None) -> int:
     with _locked_fleet(folder_, any_rules=True) as (place, fleet):
         unfinished = list[str]()
         if fleet.rules == "plugin":
-            fleet, unfinished = plugin.convert(place, fleet)
+            fleet, unfinished = applying.convert(place, fleet)
         if applying.obeys_plugin(place):  # it reads no files before mosquitto.conf is changed
             unfinished += applying.conf_differences(place, fleet)
         else:
