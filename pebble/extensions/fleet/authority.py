@@ -13,7 +13,7 @@ from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, load_pem_private_key
 
 from pebble.config.visible import shown
-from pebble.extensions.fleet.certificates import CertificateError
+from pebble.extensions.fleet.certificates import CertificateError, Shown
 from pebble.ownership import read_plain
 from pebble.runtime.whole_file import write
 
@@ -83,16 +83,13 @@ def certificate_in(file: Path) -> x509.Certificate:
         raise CertificateError(f"{file} holds no certificate") from None
 
 
-def names_of(certificate: x509.Certificate) -> tuple[str, ...]:
-    """Return the hosts in a certificate."""
+def show(file: Path) -> Shown:
+    """Return the content of a certificate file. Raises CertificateError."""
+    certificate = certificate_in(file)
     values = (extension.value for extension in certificate.extensions)
     names = (name for value in values if isinstance(value, x509.SubjectAlternativeName) for name in value)
-    return tuple(shown(str(name.value)) for name in names)
-
-
-def fingerprint(certificate: x509.Certificate) -> str:
-    """Return a certificate's SHA-256 in the form that browsers show."""
-    return certificate.fingerprint(SHA256()).hex(":").upper()
+    sha256 = certificate.fingerprint(SHA256()).hex(":").upper()
+    return Shown(file, tuple(shown(str(name.value)) for name in names), certificate.not_valid_after_utc, sha256)
 
 
 def _general_names(hosts: Iterable[str], *, networks: bool = False) -> list[x509.GeneralName]:

@@ -79,9 +79,7 @@ def show(file: Path) -> Shown:
     """Return the content of a certificate file. Raises CertificateError."""
     from pebble.extensions.fleet import authority
 
-    certificate = authority.certificate_in(file)
-    names, until = authority.names_of(certificate), certificate.not_valid_after_utc
-    return Shown(file, names, until, authority.fingerprint(certificate))
+    return authority.show(file)
 
 
 def only_certificates(content: bytes) -> bytes:
