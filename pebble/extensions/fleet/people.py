@@ -140,7 +140,8 @@ class People:
         rows = self._rows("SELECT name, role, salt, hash FROM people WHERE name = ?", looked_up)
         stored_name, role, salt, expected = rows[0] if rows else ("", "", b"no such person..", self._no_hash)
         typed = password[: 2 * MAX_PASSWORD]  # twice: an accent may be typed as a character beside its letter
-        hashes = [_hash(spelling, salt) for spelling in _spellings(typed)]
+        # composed, and as typed, which earlier versions stored
+        hashes = [_hash(form, salt) for form in {normalize("NFC", typed), typed, normalize("NFD", typed)}]
         is_right = any(hmac.compare_digest(digest, expected) for digest in hashes)
         if not is_right or not stored_name or len(normalize("NFC", typed)) > MAX_PASSWORD:
             return None
@@ -271,11 +272,6 @@ def usable(password: str) -> str:
     if not MIN_PASSWORD <= len(password) <= MAX_PASSWORD:
         raise PebbleError(f"a password has {MIN_PASSWORD} to {MAX_PASSWORD} characters")
     return password
-
-
-def _spellings(password: str) -> set[str]:
-    """Return the forms of a password to compare: composed, and as typed, which earlier versions stored."""
-    return {normalize("NFC", password), password, normalize("NFD", password)}
 
 
 @cache

@@ -101,7 +101,7 @@ class RobotView:
     """A robot, from the messages it publishes."""
 
     def __init__(self, base: str) -> None:
-        self.base = base
+        self.base, self.name = base, base.rpartition("/")[2]
         self.liveness = Liveness()
         self.estop = RobotEstop(base)
         self.control = RobotControl(self.estop)
@@ -114,11 +114,6 @@ class RobotView:
         self.autonomy: AutonomyStatus | None = None
         self.volts: float | None = None
         self.charging: bool | None = None
-
-    @property
-    def name(self) -> str:
-        """Return the last level of the robot's base topic."""
-        return self.base.rpartition("/")[2]
 
     # -- what arrives
 
