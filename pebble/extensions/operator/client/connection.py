@@ -19,7 +19,7 @@ from pebble.errors import ConfigError, PebbleError, TransportError
 from pebble.extensions.operator.client.named_topics import NamedTopics
 from pebble.extensions.operator.client.names import ANY_ROBOT, Names, base_of, spellings
 from pebble.extensions.operator.client.robot_estop import RobotEstop
-from pebble.extensions.operator.client.url import password, settings_of
+from pebble.extensions.operator.client.url import settings_of
 from pebble.extensions.operator.notices import PATIENCE_S, noticed
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.connections import REMOTE_RECONNECT_S, local_settings, mqtt_settings, zenoh_settings
@@ -151,8 +151,7 @@ def resolve(target: Target) -> tuple[str, Any, Names, str]:
     url = str(target.url)
     if target.remote:
         raise PebbleError("--remote needs --config; with --url name the remote broker itself")
-    file = target.password_file
-    kind, settings = settings_of(url, password=password(file), password_file=file, ca_cert=target.ca_cert)
+    kind, settings = settings_of(url, password_file=target.password_file, ca_cert=target.ca_cert)
     base = ANY_ROBOT if target.robot is None else base_of(target.robot)
     return kind, settings, Names(base, account=_account(settings)), url
 

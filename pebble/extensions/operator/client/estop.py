@@ -103,9 +103,9 @@ class RobotStop:
         )
 
     @property
-    def unconfirmed(self) -> dict[str, str]:
-        """Return the reasons by owner, for owners that have not confirmed."""
-        return {owner: "has not confirmed" for owner in self.estop.owners if not self._has_taken_it(owner)}
+    def unconfirmed(self) -> list[str]:
+        """Return the owners that have not confirmed."""
+        return [owner for owner in self.estop.owners if not self._has_taken_it(owner)]
 
     @property
     def why(self) -> str:
@@ -125,7 +125,7 @@ class RobotStop:
             return "its broker refuses emergency stops, so it gets zeros" if self.estop.drives else "it does not drive"
         if not self.estop.owners:
             return "its capabilities list no valid motor owners"
-        reasons = [f"{owner} {why}" for owner, why in self.unconfirmed.items()]
+        reasons = [f"{owner} has not confirmed" for owner in self.unconfirmed]
         if self.estop.zeros:
             reasons.append(_ZEROS)
         why = ", ".join(reasons)

@@ -19,12 +19,16 @@ class UrlError(PebbleError):
 
 
 def settings_of(
-    url: str, *, password: str | None = None, password_file: Path | None = None, ca_cert: Path | None = None
+    url: str, *, password_file: Path | None = None, ca_cert: Path | None = None
 ) -> tuple[str, MqttSettings | ZenohSettings]:
     """Return the kind of transport and its settings. Raises UrlError, whose text never contains the password.
 
-    ``password_file``: the file from which the password was read, if it was.
+    The broker's password is the text of ``password_file``, which raises PebbleError, or the environment's value.
     """
+    if password_file is None:
+        password = os.environ.get("PEBBLE_PASSWORD")
+    else:
+        password = read_password(password_file, "--password-file")
     scheme, _, rest = url.partition(":")
     scheme = scheme.lower()
     if scheme == "zenoh":
@@ -32,11 +36,6 @@ def settings_of(
     if scheme in _PORTS and rest.startswith("//"):
         return "mqtt", replace(_mqtt(url, password, ca_cert), password_file=password_file)
     raise UrlError(f"--url must be {FORMS}")
-
-
-def password(file: Path | None) -> str | None:
-    """Return the broker's password: the text of ``file``, or the environment's value. Raises PebbleError."""
-    return os.environ.get("PEBBLE_PASSWORD") if file is None else read_password(file, "--password-file")
 
 
 def _zenoh(path: str) -> ZenohSettings:

@@ -68,17 +68,13 @@ def with_target(*, program: str = "tool", robot: bool = False) -> Callable[[Call
 
 def broker_of(option: str, url: str, password_file: Path | None, ca_cert: Path | None) -> MqttSettings:
     """Return the settings of the MQTT broker that an option names. Raises PebbleError."""
-    from pebble.extensions.operator.client.url import (  # not all commands that use this module connect
-        FORMS,
-        UrlError,
-        password,
-        settings_of,
-    )
+    # not all commands that use this module connect
+    from pebble.extensions.operator.client.url import FORMS, UrlError, settings_of
     from pebble.transports import MqttSettings
 
     forms = "mqtt://HOST[:PORT] or mqtts://…"
     try:
-        _, settings = settings_of(url, password=password(password_file), password_file=password_file, ca_cert=ca_cert)
+        _, settings = settings_of(url, password_file=password_file, ca_cert=ca_cert)
     except UrlError as error:
         raise UrlError(str(error).replace("--url", option).replace(FORMS, forms)) from None
     if not isinstance(settings, MqttSettings):

@@ -14,7 +14,7 @@ import typer
 
 from pebble.config.visible import shown
 from pebble.errors import PebbleError
-from pebble.extensions.operator.client.url import password, settings_of
+from pebble.extensions.operator.client.url import settings_of
 from pebble.extensions.operator.commands import show
 from pebble.extensions.operator.commands.options import CaCert, PasswordFile
 from pebble.extensions.operator.signals import handled_by
@@ -74,7 +74,7 @@ def replay(
     options = Options(system=base or SYSTEM, incoming=incoming, only=tuple(only or ()))
     if incoming and speed < _WITH_COMMANDS:
         raise PebbleError(f"--speed {speed:g} would drive a robot for longer than it was: leave out --incoming")
-    kind, settings = settings_of(url, password=password(password_file), password_file=password_file, ca_cert=ca_cert)
+    kind, settings = settings_of(url, password_file=password_file, ca_cert=ca_cert)
 
     def make_transport(name: str, will: Message | None) -> Transport:
         return create(kind, name.replace("/", "-"), settings, will=will)

@@ -106,7 +106,7 @@ def test_under_a_flood_of_stops_an_obeyed_one_is_confirmed_and_a_restart_before_
     assert (stop.confirmed, stop.robots[GOOB].saved, stop.finished) == (True, False, False)
     robot.owners[0] = Owner(GOOB, "left", boot="ffffffff", persisted=True)
     receive(stop, robot.owners[0].state(), now=0.3)
-    assert (stop.confirmed, stop.robots[GOOB].unconfirmed) == (False, {"left": "has not confirmed"})
+    assert (stop.confirmed, stop.robots[GOOB].unconfirmed) == (False, ["left"])
     assert topics(stop.tick(0.8)) == [ESTOP, DRIVE]
 
 

@@ -11,7 +11,7 @@ import pytest
 from pebble.errors import PebbleError
 from pebble.extensions.operator.client.named_topics import NamedTopics
 from pebble.extensions.operator.client.names import Names, base_of
-from pebble.extensions.operator.client.url import UrlError, password, settings_of
+from pebble.extensions.operator.client.url import UrlError, settings_of
 from pebble.runtime.connections import ALL_VITAL
 from pebble.transports import Message, MqttSettings, QoS, ZenohSettings
 
@@ -132,19 +132,19 @@ def test_mqtt_urls(url: str, settings: MqttSettings) -> None:
     assert settings_of(url) == ("mqtt", replace(settings, vital=ALL_VITAL))
 
 
-def test_encrypted_urls_and_run_directories(tmp_path: Path) -> None:
-    kind, settings = settings_of("mqtts://ann@broker", password="secret", ca_cert=tmp_path / "ca.pem")
+def test_encrypted_urls_and_run_directories(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PEBBLE_PASSWORD", "secret")
+    kind, settings = settings_of("mqtts://ann@broker", ca_cert=tmp_path / "ca.pem")
     assert isinstance(settings, MqttSettings)
     assert (kind, settings.port, settings.username, settings.password) == ("mqtt", 8883, "ann", "secret")
+    (tmp_path / "password").write_text("geheim\n")
+    file = tmp_path / "password"
+    assert settings_of("mqtt://ann@broker", password_file=file)[1] == MqttSettings(
+        host="broker", username="ann", password="geheim", password_file=file, vital=ALL_VITAL
+    )
     assert settings.tls is not None
     assert settings.tls.ca_cert == tmp_path / "ca.pem"
     assert settings_of(f"zenoh:{tmp_path}") == ("zenoh", ZenohSettings(run_dir=tmp_path, client=True))
-
-
-def test_a_password_comes_from_a_file_or_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "right").write_text("geheim\n")
-    monkeypatch.setenv("PEBBLE_PASSWORD", "of all")
-    assert [password(file) for file in (tmp_path / "right", None)] == ["geheim", "of all"]
 
 
 @pytest.mark.parametrize("url", ["mqtts://:geheim@broker", "mqtt://ann:geheim@broker:x"])
