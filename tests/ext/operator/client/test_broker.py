@@ -1,13 +1,16 @@
-"""Messages on their way to the event loop: in order, in parts, and no more than fit."""
+"""Messages on their way to the event loop, and lines to a terminal: in order, in parts, and no more than fit."""
 
 from __future__ import annotations
 
 import asyncio
+import threading
 import time
 
 import pytest
 
+from pebble.extensions.operator import notices
 from pebble.extensions.operator.client.broker import MAX_BYTES, MAX_MESSAGES, Arrived
+from pebble.extensions.operator.notices import PrintingThread
 from pebble.transports import Message, QoS
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.ext.page.media.robots import broker_on
@@ -42,10 +45,12 @@ def test_bytes_are_bounded_and_given_back() -> None:
     assert waiting.dropped == 1
 
 
-async def _flood() -> tuple[list[str], int, int]:
-    """Publish 200 messages to a slow handler that fails for the third."""
+def test_a_flood_leaves_the_loop_its_turns_and_a_handler_that_fails_holds_back_nothing(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     taken: list[str] = []
-    turns = 0
+    hub = MemoryHub()
+    broker = broker_on(hub)
 
     def slow(one: Message, _at: float) -> None:
         end = time.monotonic() + 0.001
@@ -55,25 +60,46 @@ async def _flood() -> tuple[list[str], int, int]:
         if one.topic == "a/2":
             raise ValueError(one.topic)
 
-    hub = MemoryHub()
-    broker = broker_on(hub)
-    await broker.open()
-    await broker.subscribe("#", slow)
-    with MemoryTransport("operator", hub) as operator:
-        for number in range(200):
-            operator.publish(f"a/{number}", b"1", qos=QoS.DELIVERED)
-        while len(taken) < 200:
-            await asyncio.sleep(0)
-            turns += 1
-    await broker.close()
-    return taken, turns, broker.dropped
+    async def flood() -> int:
+        """Publish 200 messages to the handler; return how often the loop had a turn meanwhile."""
+        turns = 0
+        await broker.open()
+        await broker.subscribe("#", slow)
+        with MemoryTransport("operator", hub) as operator:
+            for number in range(200):
+                operator.publish(f"a/{number}", b"1", qos=QoS.DELIVERED)
+            while len(taken) < 200:
+                await asyncio.sleep(0)
+                turns += 1
+        await broker.close()
+        return turns
 
-
-def test_a_flood_leaves_the_loop_its_turns_and_a_handler_that_fails_holds_back_nothing(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    taken, turns, dropped = asyncio.run(_flood())
+    assert asyncio.run(flood()) >= 5  # 200 ms of work, in parts of 10 ms
     assert taken == [f"a/{number}" for number in range(200)]
-    assert turns >= 5  # 200 ms of work, in parts of 10 ms
-    assert dropped == 0
+    assert broker.dropped == 0
     assert "a message on a/2" in caplog.text
+
+
+def test_lines_are_printed_in_turn_also_after_an_error_and_hold_up_nothing() -> None:
+    printing, printed, goes_on = PrintingThread(), list[str](), threading.Event()
+    for prints in (goes_on.wait, lambda: printed[0], lambda: printed.append("a"), lambda: printed.append("b")):
+        printing.run(prints)
+    printing.close(0.01)
+    assert not printed
+    goes_on.set()
+    printing.close()
+    assert printed == ["a", "b"]
+
+
+def test_lines_are_bounded_and_what_was_dropped_is_said(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(notices, "_MOST", 2)
+    printing, printed, goes_on = PrintingThread(), list[int](), threading.Event()
+    printing.run(goes_on.wait)
+    for number in range(9):
+        printing.run(lambda number=number: printed.append(number))
+    goes_on.set()
+    printing.close()
+    assert printed == list(range(len(printed)))
+    assert capsys.readouterr().err == f"pebble: lines that were not printed, as too many waited: {9 - len(printed)}\n"
