@@ -278,6 +278,9 @@ def test_while_the_file_cannot_be_read_a_session_stays_what_it_was(tmp_path: Pat
         assert people.session(token) == session
         people.end_session(token)
         assert people.session(token) is None
+        with closing(sqlite3.connect(tmp_path / "people")) as other:
+            other.execute("ALTER TABLE sessions RENAME TO away")
+        assert people.session(token) is None, "what has ended"
 
 
 def test_a_look_for_a_person_writes_nothing_and_needs_no_tables(tmp_path: Path) -> None:

@@ -302,9 +302,11 @@ def test_it_starts_once_the_first_has_gone(alone: World, name: str) -> None:
     alone.broker.retained[will("a").topic] = Message(
         will("a").topic, b'{"t": 1, "run": "f", "robots": ["%s"]}' % GOOB.encode(), retain=True
     )
+    alone.operators[0].publish("incoming/estop", b"old", retain=True)
     alone.running[name] = Running(alone, name)
     alone.run(3)
     assert alone.all_pass()
+    assert alone.robots[0].payloads("incoming/estop") == [], "a stop that is retained is no live one"
 
 
 def test_gateways_of_other_robots_share_a_broker() -> None:
