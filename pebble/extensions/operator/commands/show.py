@@ -16,6 +16,7 @@ from pebble.config.visible import shown
 from pebble.contract.identity import parse_topic
 from pebble.contract.payloads import EstopState
 from pebble.extensions.media.rate_meter import RateMeter
+from pebble.extensions.operator.client.discovery import Discovery
 from pebble.extensions.operator.client.names import Names, id_of
 from pebble.extensions.operator.client.robot_estop import RobotEstop
 from pebble.extensions.operator.client.stamps import stamp_of
@@ -156,11 +157,10 @@ def _is_text(payload: bytes) -> bool:
 class TopicRecord:
     """The newest message of one topic, and the rate of live ones."""
 
-    retained = False
-    last: Message
-    arrived: float
-
     def __init__(self) -> None:
+        self.retained = False
+        self.last: Message | None = None
+        self.arrived = 0.0
         self.meter = RateMeter(window_s=math.inf, limit=_WINDOW)
 
     def add(self, message: Message, now: float) -> None:
@@ -208,6 +208,21 @@ def print_listing(listing: Listing, now: float, wall: float) -> None:
         typer.echo(f"omitted: {listing.omitted} messages of further topics")
 
 
+def remarks(listing: Listing, wall: float) -> list[str]:
+    """Return a line for each stopped robot, and one for each with a thin link."""
+    discovery = Discovery()
+    for record in listing.records.values():
+        if record.last is not None:
+            discovery.receive(record.last, record.arrived, wall)
+    robots = sorted(discovery.all_robots(), key=lambda robot: robot.base)
+    slow = [
+        f"{shown(robot.name)} has a slow connection: commands take {robot.slow_s:.1f} s"
+        for robot in robots
+        if robot.slow_s is not None
+    ]
+    return [stopped_line(robot.estop, wall) for robot in robots if robot.latched] + slow
+
+
 def stopped_line(robot: RobotEstop, wall: float) -> str:
     """Return a line such as ``goob is stopped by ann@desk, 3 min ago: a dog``; empty if it is not stopped."""
     state = robot.stopped_by
@@ -222,19 +237,21 @@ def stopped(state: EstopState, wall: float) -> str:
 
 def _cells(record: TopicRecord, now: float, wall: float) -> tuple[str, str, str, str]:
     """Return the cells retained, rate, size and age of a topic; ``now`` is monotonic, ``wall`` epoch seconds."""
+    retained = "yes" if record.retained else ""
+    if record.last is None:
+        return retained, "", "", ""
     hz = record.meter.rate(now)
     rate = "once" if record.meter.count else ""
     if hz:
         rate = f"{hz:.1f} Hz"
-    retained = "yes" if record.retained else ""
-    return retained, rate, size(len(record.last.payload)), _age(record, now, wall)
+    return retained, rate, size(len(record.last.payload)), _age(record, record.last, now, wall)
 
 
-def _age(record: TopicRecord, now: float, wall: float) -> str:
-    """Return the age of the newest message: if live, since its arrival; if retained, since its payload's stamp."""
-    if not record.last.retain:
+def _age(record: TopicRecord, last: Message, now: float, wall: float) -> str:
+    """Return the age of a message: if live, since its arrival; if retained, since the stamp in its payload."""
+    if not last.retain:
         return duration(now - record.arrived)
-    stamp = stamp_of(parsed(record.last.payload))
+    stamp = stamp_of(parsed(last.payload))
     return "?" if stamp is None else duration(max(0.0, wall - stamp))
 
 

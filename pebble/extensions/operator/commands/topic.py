@@ -90,6 +90,8 @@ def list_(
             if message is not None:
                 listing.add(message, time.monotonic())
         show.print_listing(listing, time.monotonic(), time.time())
+        for line in show.remarks(listing, time.time()):
+            typer.echo(line)
     return 0 if listing.records else 1
 
 
