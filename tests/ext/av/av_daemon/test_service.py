@@ -20,16 +20,18 @@ from pebble.contract.payloads import MediaReport
 from pebble.errors import DeviceError
 from pebble.extensions.media.frames import FrameInfo, FrameReader
 from pebble.extensions.media.frames.frame import picture
+from pebble.extensions.media.speech import PERIOD_S, Speech
 from pebble.services.av_daemon import health, sources
 from pebble.services.av_daemon.health import NOTHING, Health
 from pebble.services.av_daemon.service import Reports
 from pebble.services.av_daemon.source import Capture, Source
 from pebble.services.av_daemon.stream import Stream
 from pebble.transports import QoS
-from tests.ext.av.media_rig import Remembering, is_speech, options
+from tests.ext.av.media_rig import Remembering, options
 from tests.fakes.installed import Installed
 from tests.kit.robot import ProgramRobot
 from tests.kit.scene import read_counter
+from tests.kit.sound import best_match
 from tests.support import WAIT_S, Broker, quickly, until
 
 PICTURE, SOUND = FrameInfo(format="mjpeg", width=640, height=480), FrameInfo(format="s16le", rate=16_000, channels=1)
@@ -379,12 +381,16 @@ def test_pictures_arrive_and_their_counter_keeps_the_rate(running: Robot) -> Non
 
 
 def test_sound_arrives_as_it_was_made(running: Robot) -> None:
+    speech = Speech(16_000).samples(0, 2 * PERIOD_S * 16_000)[:, 0].astype(float)  # what comes is somewhere in it
     with FrameReader(running.run_dir, "microphone", depth=50) as reader:
         assert reader.read(10) is not None
-        chunks = [reader.read(10) for _ in range(50)]
-    assert set(np.diff([chunk.info.sequence for chunk in chunks])) == {1}
-    received = [(chunk.info.captured_ns, chunk.data.view(np.int16)) for chunk in chunks]
-    assert sum(is_speech(received, start) for start in range(0, 160_000, 320)) == 1
+
+        def comes() -> bool:
+            chunks = [reader.read(10) for _ in range(50)]
+            assert set(np.diff([chunk.info.sequence for chunk in chunks])) == {1}
+            return best_match(np.concatenate([chunk.data.view(np.int16) for chunk in chunks]), speech) > 0.999
+
+        assert until(comes), "a busy machine leaves pieces out"
 
 
 def test_it_publishes_the_status_of_camera_and_microphone(running: Robot) -> None:
