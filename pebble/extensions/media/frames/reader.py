@@ -225,9 +225,10 @@ class FrameReader:
 
     def _why_not_map(self, size: int, segment: str) -> str:
         """Return why a writer's segment of ``size`` bytes must not be mapped; "" if it may be."""
-        if any(file.endswith(segment) for _, _, file in memory.mappings()):
+        mappings = memory.mappings()
+        if any(file.endswith(segment) for _, _, file in mappings):
             return ""  # it is mapped already: only the connection was lost
-        total = memory.mapped()
+        total = sum(end - start for start, end, _ in mappings)
         if total > MAPPED_LIMIT:
             return (
                 f"writers of {self._names.stream} were restarted so often that {total >> 20} MiB of their memory are "
