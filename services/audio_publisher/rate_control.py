@@ -71,19 +71,15 @@ class RateController:
     def step(self) -> Step:
         return self._steps[self._levels.level]
 
-    @property
-    def configured(self) -> Step:
-        """Settings of full quality."""
-        return self._steps[0]
-
-    def poll(self, now: float, encoding: str) -> Step | None:
-        """Measure how long packets wait; return another step if that is better. Only Opus has steps."""
+    def poll(self, now: float, encoding: str) -> None:
+        """Measure how long packets wait, and choose another step if that is better. Only Opus has steps."""
         outgoing = self._outgoing()
         for packet in self._in_flight.acknowledge(outgoing.waiting):
             self._rests.note(now - packet.at - outgoing.round_trip_s, now)
         self._is_resting = self._rests.lasts(now)
         self._age_s = max(0.0, self._in_flight.age_s(now) - outgoing.round_trip_s)
-        return self.step if encoding == "opus" and self._levels.poll(self._age_s, now) else None
+        if encoding == "opus":
+            self._levels.poll(self._age_s, now)
 
     def may_send(self, encoding: str) -> bool:
         """True if another packet would arrive in time, by the last poll."""
@@ -113,8 +109,8 @@ class LevelControl:
         self._raised_at = float("-inf")  # when the quality last rose
         self._calm_s = _FIRST_CALM_S  # how long it has to be fast before a step up
 
-    def poll(self, age_s: float, now: float) -> bool:
-        """Note that the oldest packet has waited for ``age_s``; True if the level changes."""
+    def poll(self, age_s: float, now: float) -> None:
+        """Note that the oldest packet has waited for ``age_s``, and change the level if that is better."""
         if now - self._polled_at > _GAP_S:  # what was measured before says nothing about now
             self._slow_since = self._fast_since = None
         self._polled_at = now
@@ -124,24 +120,18 @@ class LevelControl:
         is_fast = age_s < _FAST_S or now - self._empty_at < _BEACON_S  # a Wi-Fi beacon may delay answers
         self._fast_since = _since(self._fast_since, is_fast, now)
         if now - self._changed_at < _PAUSE_S:
-            return False
+            return
         if self._slow_since is not None and now - self._slow_since >= _PATIENCE_S and self.level < self._last:
             # From the first fall on, calm has to last for _CALM_S at least, and twice as long as before if this fall
             # comes soon after the last rise: then that rise has failed.
             last_rise_failed = now - self._raised_at < 2 * self._calm_s
             longer_s = 2 * self._calm_s if last_rise_failed else self._calm_s
             self._calm_s = min(max(_CALM_S, longer_s), _CALMEST_S)
-            return self._change(1, now)
-        if self.level and self._fast_since is not None:
+            self.level, self._changed_at = self.level + 1, now
+        elif self.level and self._fast_since is not None:
             calm_since = max(self._fast_since, self._changed_at)  # earlier it was at another step
             if now - calm_since > self._calm_s:
-                self._raised_at = now
-                return self._change(-1, now)
-        return False
-
-    def _change(self, by: int, now: float) -> bool:
-        self.level, self._changed_at = self.level + by, now
-        return True
+                self.level, self._changed_at, self._raised_at = self.level - 1, now, now
 
 
 def _since(before: float | None, holds: bool, now: float) -> float | None:

@@ -124,7 +124,7 @@ class AudioPublisher(Service):
 
         If only the rate control's :class:`Step` changes, that waits for the end of a packet.
         """
-        step = self._rate.step if self._requested == "opus" else self._rate.configured
+        step = self._rate.step
         needed = (self._requested, rate, channels)
         may_change_step = self._encoder is None or not self._encoder.part_way
         if self._encoder is None or needed != self._made_for or (step != self._made_step and may_change_step):

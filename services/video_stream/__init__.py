@@ -7,7 +7,7 @@ EXTENSION = Extension(
     needs=("media",),
     sections={"services.video_stream": "pebble.services.video_stream.config:VideoStream"},
     rules="pebble.services.video_stream.config:RULES",
-    programs="pebble.services.video_stream.offers:programs",
-    offers="pebble.services.video_stream.offers:offers",
+    programs="pebble.services.video_stream.config:programs",
+    offers="pebble.services.video_stream.config:offers",
     page="docs/ext/media.md",
 )

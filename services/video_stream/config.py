@@ -1,14 +1,18 @@
-"""The config section of a third party's streaming program."""
+"""A third party's streaming program: its config section, what it offers, and the process that runs it."""
 
 import re
+from collections.abc import Iterator
 from typing import Annotated, ClassVar
 
 from msgspec.structs import replace
 
+from pebble.config import Config
 from pebble.config.hosts import HostError, split
 from pebble.config.problems import Path
 from pebble.config.reader import Reader, Rule
 from pebble.config.types import COMMAND, Command, ServiceSection, doc
+from pebble.contract.capabilities import CapabilitiesValue, offered
+from pebble.extension import Program
 
 
 class VideoStream(ServiceSection, frozen=True, kw_only=True):
@@ -52,3 +56,20 @@ def _without_login(url: str) -> str:
 
 
 RULES: tuple[Rule, ...] = ((VideoStream, _check),)
+
+
+def programs(config: Config) -> Iterator[Program]:
+    """Yield the process that runs the streaming program while the bridge requests it."""
+    if _is_requested(config):
+        service, url = "pebble.services.video_stream.service:VideoStream", config.section(VideoStream).webrtc_url
+        yield Program("video_stream", service, on_demand=True, webrtc_url=url)
+
+
+def offers(config: Config, value: CapabilitiesValue) -> CapabilitiesValue:
+    """Return ``value`` with the pictures of the streaming program."""
+    return replace(value, video=offered(value.video, True)) if _is_requested(config) else value
+
+
+def _is_requested(config: Config) -> bool:
+    section = config.section(VideoStream)
+    return section.enabled and bool(section.command) and config.services.mqtt_bridge.enabled

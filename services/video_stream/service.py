@@ -3,7 +3,7 @@
 import signal
 from typing import Any
 
-from pebble.errors import ConfigError, DeviceError
+from pebble.errors import DeviceError
 from pebble.extensions.media.child import Child, how_ended
 from pebble.runtime.environment import child_environment
 from pebble.runtime.service import Service, every
@@ -23,8 +23,6 @@ class VideoStream(Service):
 
     def start(self) -> None:
         options = self.config.section(VideoStreamSection)
-        if not options.command:
-            raise ConfigError("services.video_stream.command: is missing, write the program that streams the video")
         try:
             self._program = Child(options.command, child_environment())
         except (OSError, ValueError) as error:

@@ -89,11 +89,8 @@ class AudioReceiver(Section, frozen=True, kw_only=True):
 
     def words(self, rate: int, channels: int) -> list[str]:
         """Return the words of ``command`` for sound of this rate and number of channels, to start the player."""
-        values = {"{rate}": str(rate), "{channels}": str(channels), "{device}": self.device}
-        words = list(self.command)
-        for name, value in values.items():
-            words = [word.replace(name, value) for word in words]
-        return words
+        rated = (word.replace("{rate}", str(rate)).replace("{channels}", str(channels)) for word in self.command)
+        return [word.replace("{device}", self.device) for word in rated]
 
 
 class Media(Section, frozen=True, kw_only=True):

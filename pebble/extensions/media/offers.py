@@ -24,9 +24,9 @@ def _video(config: Config, addresses: Addresses) -> VideoOffer:
         command_topic=addresses[c.VIDEO_CONTROL].topic,
         flag_topic=addresses[c.MQTT_VIDEO].topic,
         overlays_topic=addresses[c.VIDEO_OVERLAYS].topic,
-        width=_first(sent.publish_width, sent.width),
-        height=_first(sent.publish_height, sent.height),
-        fps=_first(sent.publish_fps, sent.target_fps, sent.fps),
+        width=sent.publish_width or sent.width,
+        height=sent.publish_height or sent.height,
+        fps=sent.publish_fps or sent.target_fps or sent.fps,
         encoding=sent.encoding,
         encodings=list(pyav.available(ALL_VIDEO)),
     )
@@ -56,8 +56,3 @@ def files_offer(config: Config, command: c.Channel, files: c.Channel, status: c.
         files_topic=addresses[files].topic,
         status_topic=addresses[status].topic,
     )
-
-
-def _first(*values: float | None) -> float | None:
-    """Return the first argument that is not None; 0 counts as a value."""
-    return next((value for value in values if value is not None), None)

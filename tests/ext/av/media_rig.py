@@ -8,17 +8,18 @@ from __future__ import annotations
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from types import TracebackType
+from types import SimpleNamespace, TracebackType
 from typing import Any, Self
 
 import msgspec
 import numpy as np
 
 from pebble.contract.payloads import MediaReport
+from pebble.extensions.media.decode import VideoDecoder
 from pebble.extensions.media.frames import FrameInfo, FrameWriter
+from pebble.extensions.media.sound import SoundDecoder
 from pebble.extensions.media.speech import Speech
 from pebble.services.av_daemon.config import AvDaemon
 from pebble.services.av_daemon.source import Source
@@ -119,16 +120,14 @@ class Filming(Device):
         self.writer.write(self._picture, info)
 
 
-class Operator(ABC):
+class Operator:
     """Decodes every packet of one topic of the robot."""
 
-    def __init__(self, port: int, metric: str) -> None:
-        self.transport = client(f"operator-{metric}", port)
-        self.received: list[Any] = []
-        self.transport.subscribe(f"{BASE}/outgoing/{metric}", self.receive, qos=QoS.LATEST)
-
-    @abstractmethod
-    def receive(self, message: Message) -> None: ...
+    def __init__(self, port: int, metric: str, decoder: VideoDecoder | SoundDecoder) -> None:
+        self.transport, self.decoder = client(f"operator-{metric}", port), decoder
+        self.received: list[Any] = []  # what was decoded
+        self.arrived: list[float] = []  # and when each of it came, epoch seconds
+        self.transport.subscribe(f"{BASE}/outgoing/{metric}", self._receive, qos=QoS.LATEST)
 
     def wait(self, count: int, timeout: float = WAIT_S) -> list[Any]:
         """Until so many packets more have come; returns these."""
@@ -140,8 +139,11 @@ class Operator(ABC):
     def wait_for(self, encoding: str) -> None:
         assert until(lambda: bool(self.received) and self.received[-1].encoding == encoding), f"no {encoding} came"
 
-    def close(self) -> None:
-        self.transport.close()
+    def _receive(self, message: Message) -> None:
+        decoded = self.decoder.feed(message.payload)
+        if decoded is not None:
+            self.arrived.append(time.time())
+            self.received.append(decoded)
 
 
 def options(*, video: dict[str, Any] | None = None, audio: dict[str, Any] | None = None, **more: Any) -> AvDaemon:
@@ -155,17 +157,6 @@ def grabbed(source: Source) -> tuple[FrameInfo, np.ndarray]:
 
 
 speech_of = cache(Speech)
-
-
-def is_speech(chunks: Sequence[tuple[int, np.ndarray]], start: int) -> bool:
-    """Is every chunk of 20 ms at 16 kHz, with its time in ns, what was said then? ``start``: sample of the first.
-
-    On a busy machine some may be missing, but none may be elsewhere.
-    """
-    speech, first_ns = speech_of(16_000), chunks[0][0]
-    places = [start + 320 * round((at_ns - first_ns) / 20_000_000) for at_ns, _ in chunks]
-    pairs = zip(places, chunks, strict=True)
-    return all(np.array_equal(speech.samples(place, 320)[:, 0], sound) for place, (_, sound) in pairs)
 
 
 class Remembering:
@@ -188,17 +179,13 @@ class Remembering:
         self.frames.append((info, data.copy()))
         return True
 
-    def slot(self, size: int) -> RememberingSlot | None:
-        return RememberingSlot(self, size) if self._born else None
+    def slot(self, size: int) -> Any:
+        if not self._born:
+            return None
+        array = np.full(size, 255, np.uint8)
 
+        def send(info: FrameInfo) -> bool:
+            self.counters.add("born")
+            return self.write(array, info)
 
-class RememberingSlot:
-    def __init__(self, writer: Remembering, size: int) -> None:
-        self.array = np.full(size, 255, np.uint8)
-        self._writer = writer
-
-    def send(self, info: FrameInfo) -> bool:
-        self._writer.counters.add("born")
-        return self._writer.write(self.array, info)
-
-    def drop(self) -> None: ...
+        return SimpleNamespace(array=array, send=send)

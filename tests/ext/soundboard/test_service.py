@@ -14,14 +14,12 @@ from unicodedata import normalize
 import numpy as np
 import pytest
 
-from pebble.contract import MEDIA_REPORT, codec
-from pebble.contract.payloads import MediaReport, SoundboardFiles
+from pebble.contract.payloads import SoundboardFiles
 from pebble.errors import PebbleError
 from pebble.extensions.lab.simulation.loudspeaker import Playback, playbacks
 from pebble.extensions.media.pcm import Samples
 from pebble.services.soundboard_handler.clips import Clips
 from pebble.services.soundboard_handler.service import SoundboardHandler
-from pebble.transports import QoS
 from tests.ext.media.test_sound import encode
 from tests.kit.robot import Program, ProgramRobot
 from tests.support import WAIT_S, Broker, gone, until
@@ -104,11 +102,6 @@ class Soundboard(ProgramRobot):
         return self.world.payloads("soundboard-files")
 
     @property
-    def files(self) -> list[str]:
-        names: list[str] = self.catalogues[-1]["files"]
-        return names
-
-    @property
     def played(self) -> list[Playback]:
         return playbacks(self.record)
 
@@ -127,14 +120,9 @@ Make = Callable[..., Soundboard]
 
 @pytest.fixture
 def make(local: Broker) -> Iterator[Make]:
-    """Makes one with these options; with ``clip``, that tone is there and the service runs."""
+    """Makes one with these options."""
     with ExitStack() as ends:
-
-        def made(kind: str = "mqtt", *, clip: float = 0.0, **options: Any) -> Soundboard:
-            board = ends.enter_context(Soundboard(kind, local.port, **options))
-            return board.with_clip("a.wav", clip) if clip else board
-
-        yield made
+        yield lambda kind="mqtt", **options: ends.enter_context(Soundboard(kind, local.port, **options))
 
 
 @pytest.fixture
@@ -152,7 +140,7 @@ def test_a_clip_is_listed_played_as_it_is_and_over(make: Make, kind: str) -> Non
     write_wav(both.sounds / "warn" / "ba\u0308r.WAV", tone(0.1))
     (both.sounds / "notes.txt").write_text("no sound")
     both.start()
-    assert both.files == ["intro.wav", "warn/ba\u0308r.WAV"]
+    assert both.catalogues[-1]["files"] == ["intro.wav", "warn/ba\u0308r.WAV"]
     assert both.catalogues[-1].keys() == {"files", "controls", "timestamp"}
     assert both.statuses[-1] | {"timestamp": 0} == {
         "playing": False, "file": None, "error": None, "controls": True, "timestamp": 0
@@ -167,7 +155,7 @@ def test_a_clip_is_listed_played_as_it_is_and_over(make: Make, kind: str) -> Non
 
 def test_what_plays_and_what_stops(make: Make) -> None:
     """The forms of commands are decoded in tests/contract/test_codec.py."""
-    board = make(player_command=["sh", "-c", "exec sleep 60"], clip=0.1)
+    board = make(player_command=["sh", "-c", "exec sleep 60"]).with_clip("a.wav", 0.1)
     plays: list[Any] = [{"action": word.upper(), "file": "a.wav"} for word in PLAY]
     plays += [{"action": "unknown", "enabled": True, "file": "a.wav"}]
     stops: list[Any] = [{"action": word.title(), "enabled": True} for word in STOP]
@@ -266,22 +254,6 @@ def test_a_clip_is_repeated(board: Soundboard) -> None:
     assert until(lambda: len(board.played) >= 4)
     board.send(False)
     assert board.became(playing=False, error=None)
-
-
-@pytest.mark.parametrize(
-    ("doing", "error"),
-    [
-        ("plays 16 kHz, 1 channel", "the loudspeaker is busy (talk-back plays)"),
-        ("is silent", "player exited with code 1"),
-    ],
-)
-def test_a_loudspeaker_that_talk_back_has_is_busy(make: Make, doing: str, error: str) -> None:
-    """Its player fails at once, which one in Python does not on a busy machine."""
-    board = make(player_command=["sh", "-c", "exit 1"], clip=0.1)
-    report = codec.encode(MEDIA_REPORT, MediaReport(running=True, doing=doing))
-    board.world.transport.publish(f"{board.world.base}/outgoing/media-report/audio_receiver", report, qos=QoS.DELIVERED)
-    board.play("a.wav")
-    assert board.became(playing=False, file=None, error=error)
 
 
 def test_other_formats_are_decoded_and_played(board: Soundboard) -> None:

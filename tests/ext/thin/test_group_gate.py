@@ -6,8 +6,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from pebble.contract import DRIVE as DRIVE_CHANNEL
-from pebble.contract import LIGHTS_SOLID, MCU_COMMAND, OUTLET_COMMAND, codec, groups
+from pebble.contract import groups
 from pebble.errors import ConfigError, PayloadError
 from pebble.extensions.thin.group_gate import copy_of, is_marked
 from pebble.extensions.thin.uplink import MediaHold
@@ -187,15 +186,6 @@ ALL_MEMBERS = (
     b'{"drive-values": {"x": -0.25, "z": 0.5, "valid_ms": 400}, "lights-solid": {"r": 0.5},'
     b' "outlets/lamp/power": {"on": true}, "mcu/abc/arm": {"angle": 3}, "soundboard-command": {"action": "stop"}}'
 )
-
-
-def test_members_have_their_values() -> None:
-    members = {member.metric: member for member in groups.decode(ALL_MEMBERS)}
-    assert members["drive-values"].value == codec.decode(DRIVE_CHANNEL, b'{"x": -0.25, "z": 0.5, "valid_ms": 400}')
-    assert members["lights-solid"].channel is LIGHTS_SOLID
-    assert members["outlets/lamp/power"].channel is OUTLET_COMMAND
-    assert members["mcu/abc/arm"].channel is MCU_COMMAND
-    assert [metric for metric, member in members.items() if member.channel.ends(member.value)] == ["soundboard-command"]
 
 
 def test_copies_are_marked_where_the_owner_of_a_line_takes_the_group() -> None:

@@ -11,7 +11,7 @@ import threading
 import time
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -291,12 +291,8 @@ def command(broker: Broker) -> Iterator[None]:
 def page(broker: Broker) -> Iterator[None]:
     loop = asyncio.new_event_loop()
     task = loop.create_task(expand(MqttSettings(host="127.0.0.1", port=broker.port)))
-
-    def run_it() -> None:
-        with suppress(asyncio.CancelledError):
-            loop.run_until_complete(task)
-
-    thread = threading.Thread(target=run_it)
+    ended = asyncio.gather(task, return_exceptions=True)
+    thread = threading.Thread(target=loop.run_until_complete, args=(ended,))
     thread.start()
     try:
         yield

@@ -8,4 +8,3 @@ from pebble.extensions.media.frames.frame import FrameInfo as FrameInfo
 from pebble.extensions.media.frames.reader import FrameReader as FrameReader
 from pebble.extensions.media.frames.writer import FrameWriter as FrameWriter
 from pebble.extensions.media.frames.writer import Slot as Slot
-from pebble.transports.segments import sweep as sweep

@@ -24,8 +24,3 @@ def mappings() -> list[tuple[int, int, str]]:
             start, end = (int(address, 16) for address in place.split("-"))
             segments.append((start, end, path))
     return segments
-
-
-def mapped() -> int:
-    """Return how many bytes of shared memory this process has mapped."""
-    return sum(end - start for start, end, _ in mappings())

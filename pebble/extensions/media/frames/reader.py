@@ -54,7 +54,6 @@ class FrameReader:
         self._count_received, self._count_shared = map(self.counters.adder, ("received", "shared"))
         self.problem = ""
         self._latest = _LatestFrames(depth)  # closed while the reader is
-        self.running: set[int] = set()  # ids of writers
         self._seen: set[int] = set()  # ids of writers that were counted
         self._newest = 0, 0  # writer and number of the newest frame that has arrived
         self._replaced = -1  # the writer before that of the newest frame
@@ -108,7 +107,6 @@ class FrameReader:
             return
         (session, declared), self._session = self._session, None
         declared.clear()
-        self.running.clear()
         close_session(session)
 
     def close(self) -> None:
@@ -132,11 +130,6 @@ class FrameReader:
     def shared(self) -> bool:
         """True if frames come through shared memory. If not, `problem` explains why, unless ``sharing`` is False."""
         return self._sharing and not self.problem
-
-    @property
-    def writers(self) -> int:
-        """Number of writers of the stream now: 0 or 1, or 2 for a moment when one replaces another."""
-        return len(self.running)
 
     def read(self, timeout: float | None = None) -> Frame | None:
         """Return the newest frame that was not returned before; with ``depth``, the oldest of those that wait.
@@ -212,20 +205,18 @@ class FrameReader:
         return info.sequence - number - 1 if info.writer == writer else 0
 
     def _on_writer(self, sample: zenoh.Sample) -> None:
-        """Note that a writer begins or ends; let the session be reopened to begin or to stop sharing memory with it."""
+        """Note that a writer begins; let the session be reopened to begin or to stop sharing memory with it."""
         try:
             writer_id, size, segment = self._names.writer_of(str(sample.key_expr))
         except ValueError:
             self.counters.add("refused")
             return
         if sample.kind != zenoh.SampleKind.PUT:
-            self.running.discard(writer_id)
             return
         new = writer_id not in self._seen
         if new:
             self._seen.add(writer_id)
             self.counters.add("writers")
-        self.running.add(writer_id)
         if new and size and self._lacked_room:  # this writer shares memory, so it has found room: so may the reader
             self._lacked_room = False
             self._reopen_soon("")
@@ -234,9 +225,10 @@ class FrameReader:
 
     def _why_not_map(self, size: int, segment: str) -> str:
         """Return why a writer's segment of ``size`` bytes must not be mapped; "" if it may be."""
-        if any(file.endswith(segment) for _, _, file in memory.mappings()):
+        mappings = memory.mappings()
+        if any(file.endswith(segment) for _, _, file in mappings):
             return ""  # it is mapped already: only the connection was lost
-        total = memory.mapped()
+        total = sum(end - start for start, end, _ in mappings)
         if total > MAPPED_LIMIT:
             return (
                 f"writers of {self._names.stream} were restarted so often that {total >> 20} MiB of their memory are "

@@ -259,7 +259,7 @@ class FrameWriter:
 
 
 class Slot:
-    """Memory for one frame: fill `array`, then `send` or `drop`. After that its array must not be written to."""
+    """Memory for one frame: fill `array`, then `send` it, or forget it. After that its array must not be written to."""
 
     def __init__(self, writer: FrameWriter, chunk: Chunk) -> None:
         self._writer = writer
@@ -267,7 +267,7 @@ class Slot:
 
     @property
     def array(self) -> Bytes:
-        """One-dimensional, writable array, not zeroed. Raises TransportError when the slot was sent or dropped."""
+        """One-dimensional, writable array, not zeroed. Raises TransportError when the slot was sent."""
         return self._held().view()
 
     def send(self, info: FrameInfo) -> bool:
@@ -276,12 +276,9 @@ class Slot:
         self._chunk = None
         return self._writer._is_wanted() and self._writer._put(buffer, info, shared=True)
 
-    def drop(self) -> None:
-        self._chunk = None
-
     def _held(self) -> Chunk:
         if self._chunk is None:
-            raise TransportError("this slot has been sent or dropped")
+            raise TransportError("this slot has been sent")
         return self._chunk
 
 

@@ -108,13 +108,16 @@ def test_on_a_thin_link_a_slow_packet_is_followed_by_a_rest(make: Make, profile:
 # -- what is reduced
 
 
+def changes(levels: LevelControl, age_s: float, at: float) -> bool:
+    before = levels.level
+    levels.poll(age_s, at)
+    return levels.level != before
+
+
 def watch(levels: LevelControl, age_s: float, begin: float, seconds: float) -> list[float]:
     """A poll every 20 ms; returns when the level changed."""
-    return [
-        round(at, 2)
-        for at in (begin + 0.02 * number for number in range(round(50 * seconds)))
-        if levels.poll(age_s, at)
-    ]
+    times = (begin + 0.02 * number for number in range(round(50 * seconds)))
+    return [round(at, 2) for at in times if changes(levels, age_s, at)]
 
 
 def test_steps_save_headers_first_and_then_bits() -> None:
@@ -179,9 +182,9 @@ def test_steps_back_are_tried_ever_more_rarely() -> None:
     watch(levels, 0.18, 10.0, 3.0)
     tries, at = [], 13.0
     for _ in range(4):
-        tries.append(next(0.02 * number for number in range(50_000) if levels.poll(0.0, at + 0.02 * number)))
+        tries.append(next(0.02 * number for number in range(50_000) if changes(levels, 0.0, at + 0.02 * number)))
         at += tries[-1]
-        at += next(0.02 * number for number in range(50_000) if levels.poll(0.18, at + 0.02 * number))
+        at += next(0.02 * number for number in range(50_000) if changes(levels, 0.18, at + 0.02 * number))
     assert tries[0] > 5
     assert tries == sorted(tries)
     assert tries[-1] > 4 * tries[0]
@@ -207,30 +210,15 @@ class Mouth(Device):
         self.writer.write(samples.tobytes(), FrameInfo(**now, **self._form))
 
 
-class Ear(Operator):
-    """Decodes every packet of the robot's sound."""
-
-    def __init__(self, port: int) -> None:
-        self.arrived: list[float] = []  # epoch seconds
-        self.decoder = SoundDecoder()
-        super().__init__(port, "audio")
-
-    def receive(self, message: Message) -> None:
-        one = self.decoder.feed(message.payload)
-        if one is not None:
-            self.arrived.append(time.time())
-            self.received.append(one)
-
-
 def publisher(local: Broker, remote: Broker) -> MediaProgram:
     return MediaProgram("audio_publisher", "audio_publisher", "audio", local.port, remote.port)
 
 
 @pytest.fixture
-def ear(remote: Broker) -> Iterator[Ear]:
-    ear = Ear(remote.port)
+def ear(remote: Broker) -> Iterator[Operator]:
+    ear = Operator(remote.port, "audio", SoundDecoder())
     yield ear
-    ear.close()
+    ear.transport.close()
 
 
 def joined(received: list[ReceivedSound]) -> np.ndarray:
@@ -241,7 +229,7 @@ def is_whole(received: list[ReceivedSound]) -> bool:
     return all(later.sequence == earlier.sequence + 1 for earlier, later in pairwise(received))
 
 
-def test_every_encoding_in_turn_carries_the_recorded_speech(local: Broker, remote: Broker, ear: Ear) -> None:
+def test_every_encoding_in_turn_carries_the_recorded_speech(local: Broker, remote: Broker, ear: Operator) -> None:
     recorded = Speech(16000).samples(0, 2 * PERIOD_S * 16000)[:, 0].astype(float)  # what was heard is somewhere in it
     with publisher(local, remote) as robot, Mouth(robot.run_dir):
         pcm = ear.wait(40)
@@ -266,7 +254,7 @@ def test_every_encoding_in_turn_carries_the_recorded_speech(local: Broker, remot
 
 
 def test_the_microphone_comes_later_and_comes_back_and_so_does_the_remote_broker(
-    local: Broker, remote: Broker, ear: Ear
+    local: Broker, remote: Broker, ear: Operator
 ) -> None:
     with publisher(local, remote) as robot:
         assert robot.reported(doing="waits for the microphone")

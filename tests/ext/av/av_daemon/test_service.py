@@ -20,16 +20,18 @@ from pebble.contract.payloads import MediaReport
 from pebble.errors import DeviceError
 from pebble.extensions.media.frames import FrameInfo, FrameReader
 from pebble.extensions.media.frames.frame import picture
+from pebble.extensions.media.speech import PERIOD_S, Speech
 from pebble.services.av_daemon import health, sources
-from pebble.services.av_daemon.health import NOTHING, Asked, Health
+from pebble.services.av_daemon.health import NOTHING, Health
 from pebble.services.av_daemon.service import Reports
 from pebble.services.av_daemon.source import Capture, Source
 from pebble.services.av_daemon.stream import Stream
 from pebble.transports import QoS
-from tests.ext.av.media_rig import Remembering, is_speech, options
+from tests.ext.av.media_rig import Remembering, options
 from tests.fakes.installed import Installed
 from tests.kit.robot import ProgramRobot
 from tests.kit.scene import read_counter
+from tests.kit.sound import best_match
 from tests.support import WAIT_S, Broker, quickly, until
 
 PICTURE, SOUND = FrameInfo(format="mjpeg", width=640, height=480), FrameInfo(format="s16le", rate=16_000, channels=1)
@@ -46,9 +48,9 @@ class Streams:
 
     def __call__(
         self, writer: Remembering, open_source: Callable[[], Source], *, delay: float = 0.05, rest_s: float = 0.2,
-        asked: Asked | None = None,
+        computed: bool = True,
     ) -> Stream:  # fmt: skip
-        stream = Stream("camera", writer, open_source, first_delay_s=delay, rest_s=rest_s, asked=asked)
+        stream = Stream("camera", writer, open_source, first_delay_s=delay, rest_s=rest_s, computed=computed)
         self._all.append(stream)
         return stream
 
@@ -270,27 +272,24 @@ class TestHealth:
         assert not device.overdue(1e9)
 
     @pytest.mark.parametrize(
-        ("info", "asked", "hz", "content", "problem"),
+        ("info", "computed", "content", "problem"),
         [
-            (PICTURE, Asked(15, 640, 480), 15, None, None),
-            (PICTURE, Asked(15, 640, 480), 14, 7, "shows the same picture since 11 s"),
-            (PICTURE, Asked(15, 640, 480), 15, [1, 2, 3, 4], "shows the same pictures again and again since 11 s"),
-            (PICTURE, None, 10, 7, None),
-            (PICTURE, Asked(15, 480, 640), 15, None, "gives pictures of 640x480 where 480x640 were asked"),
-            (PICTURE, Asked(15, 640, 480), 7, None, "gives 7.0 pictures a second where 15 were asked"),
-            (PICTURE, Asked(), 99, None, None),
-            (SOUND, Asked(50), 50, NOTHING, "gives only zeros, as one that is muted or unplugged, since 11 s"),
-            (SOUND, Asked(50), 138, None, "gives 44160 samples a second where 16000 were asked"),
+            (PICTURE, False, None, None),
+            (PICTURE, False, [7], "shows the same picture since 11 s"),
+            (PICTURE, False, [1, 2, 3, 4], "shows the same pictures again and again since 11 s"),
+            (PICTURE, True, [7], None),
+            (SOUND, False, [7], "gives the same sound since 11 s"),
+            (SOUND, False, [NOTHING], "gives only zeros, as one that is muted or unplugged, since 11 s"),
         ],
     )
     def test_frames_that_come_in_time_may_show_nothing(
-        self, info: FrameInfo, asked: Asked | None, hz: int, content: int | str | list[int] | None, problem: str | None
+        self, info: FrameInfo, computed: bool, content: list[int | str] | None, problem: str | None
     ) -> None:
-        device = Health(2.0, asked)
+        device = Health(2.0, computed=computed)
         device.opening(100.0)
-        for number in range(11 * hz + 2):
-            new = content[number % len(content)] if isinstance(content, list) else content
-            device.frame(info, 100 + number / hz, content=1000 + number if new is None else new)
+        for number in range(11 * 15 + 2):
+            new = 1000 + number if content is None else content[number % len(content)]
+            device.frame(info, 100 + number / 15, content=new)
         found = device.report(111.0)
         assert (found.problem, found.last_error, found.doing) == (problem, problem, "runs")
         device.failed("unplugged")
@@ -313,7 +312,7 @@ def test_a_frozen_picture_is_noticed_although_its_header_changes(
         return Capture(FrameInfo(format="mjpeg"), data.size, data)
 
     monkeypatch.setattr(device, "grab", grab)
-    stream = streams(Remembering(), device, asked=Asked())
+    stream = streams(Remembering(), device, computed=False)
     assert until(lambda: len(pictures) > 200)
     assert until(lambda: report(stream).problem) if frozen else not report(stream).problem
 
@@ -382,12 +381,16 @@ def test_pictures_arrive_and_their_counter_keeps_the_rate(running: Robot) -> Non
 
 
 def test_sound_arrives_as_it_was_made(running: Robot) -> None:
+    speech = Speech(16_000).samples(0, 2 * PERIOD_S * 16_000)[:, 0].astype(float)  # what comes is somewhere in it
     with FrameReader(running.run_dir, "microphone", depth=50) as reader:
         assert reader.read(10) is not None
-        chunks = [reader.read(10) for _ in range(50)]
-    assert set(np.diff([chunk.info.sequence for chunk in chunks])) == {1}
-    received = [(chunk.info.captured_ns, chunk.data.view(np.int16)) for chunk in chunks]
-    assert sum(is_speech(received, start) for start in range(0, 160_000, 320)) == 1
+
+        def comes() -> bool:
+            chunks = [reader.read(10) for _ in range(50)]
+            assert set(np.diff([chunk.info.sequence for chunk in chunks])) == {1}
+            return best_match(np.concatenate([chunk.data.view(np.int16) for chunk in chunks]), speech) > 0.999
+
+        assert until(comes), "a busy machine leaves pieces out"
 
 
 def test_it_publishes_the_status_of_camera_and_microphone(running: Robot) -> None:

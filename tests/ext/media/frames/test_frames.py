@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,6 @@ from pebble.extensions.media.frames.session import METADATA, StreamNames, open_w
 from pebble.transports import segments
 from pebble.transports.peers import prepare_run_dir
 from pebble.transports.segments import SHM
-from tests.ext.media.frames.frames_peer import Options
 from tests.locking import needs_shared_memory
 from tests.support import WAIT_S, needs_root, until
 from tests.transports.forked import Forked
@@ -34,20 +33,20 @@ QVGA = 320 * 240 * 3  # a pool of these fits into the 8 MiB that users may usual
 UNPRIVILEGED_USER = os.geteuid() or 65534  # root may lock what it likes; for others the limits count
 
 
-class Peer:
+class Peer(Forked):
     """One process; `ask` for its numbers."""
 
-    def __init__(self, role: str, folder: Path, options: Options) -> None:
-        self._process = Forked("tests.ext.media.frames.frames_peer", role, folder, options)
-        assert self._line() == "up"
+    def __init__(self, role: str, folder: Path, options: dict[str, Any]) -> None:
+        super().__init__("tests.ext.media.frames.frames_peer", role, folder, options)
+        assert self.stdout.readline() == "up\n"
 
     def ask(self) -> dict[str, Any]:
-        self._process.stdin.write("?\n")
-        self._process.stdin.flush()
-        answer: dict[str, Any] = json.loads(self._line())
+        self.stdin.write("?\n")
+        self.stdin.flush()
+        answer: dict[str, Any] = json.loads(self.stdout.readline())
         return answer
 
-    def reaches(self, condition: Callable[[dict[str, Any]], object], timeout: float = WAIT_S) -> dict[str, Any]:
+    def reaches(self, condition: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
         """Ask until ``condition`` is true for an answer, and return that."""
         answers: list[dict[str, Any]] = [{}]
 
@@ -55,56 +54,39 @@ class Peer:
             answers.append(self.ask())
             return condition(answers[-1])
 
-        assert until(asked, timeout, step=0.02), answers[-1]
+        assert until(asked, step=0.02), answers[-1]
         return answers[-1]
 
     def has(self, **least: int) -> dict[str, Any]:
         """Ask until every number is at least as given."""
         return self.reaches(lambda answer: all(answer.get(name, 0) >= number for name, number in least.items()))
 
-    @property
-    def pid(self) -> int:
-        return self._process.pid
-
-    def kill(self) -> None:
-        self._process.kill()
-        self._process.wait(WAIT_S)
-        for pipe in (self._process.stdin, self._process.stdout):
+    def end(self) -> None:
+        self.kill()
+        self.wait(WAIT_S)
+        for pipe in (self.stdin, self.stdout):
             with suppress(BrokenPipeError):
                 pipe.close()
 
-    def _line(self) -> str:
-        return self._process.stdout.readline().strip()
 
-    @property
-    def running(self) -> bool:
-        return self._process.poll() is None
-
-
-class FramesNet:
-    """A run directory and its peers; `close` ends them all."""
+class FramesNet(ExitStack):
+    """A run directory and its peers, which end with it."""
 
     def __init__(self, folder: Path) -> None:
+        super().__init__()
         self.folder = folder
         folder.mkdir(mode=0o700, exist_ok=True)
-        self._peers: list[Peer] = []
 
     def start(self, role: str, **options: Any) -> Peer:
-        peer = Peer(role, self.folder, Options(**options))
-        self._peers.append(peer)
+        peer = Peer(role, self.folder, options)
+        self.callback(peer.end)
         return peer
-
-    def close(self) -> None:
-        for peer in self._peers:
-            if peer.running:
-                peer.kill()
 
 
 @pytest.fixture
 def net(tmp_path: Path) -> Iterator[FramesNet]:
-    net = FramesNet(tmp_path / "run")
-    yield net
-    net.close()
+    with FramesNet(tmp_path / "run") as net:
+        yield net
 
 
 def test_a_slow_reader_gets_the_newest(tmp_path: Path) -> None:
@@ -143,7 +125,7 @@ def test_readers_and_writers_that_are_killed_are_noticed_and_their_segments_swep
             assert (reader.ask()["writers"], reader.ask()["wrong"]) == (life, 0)
 
     all_receive(1)
-    writer.kill()
+    writer.end()
     writer = net.start("writer", size=SMALL)
     all_receive(2)
     assert len(StreamNames(net.folder, "camera").lock_paths()) == 1, "that of the killed writer is gone"
@@ -151,9 +133,9 @@ def test_readers_and_writers_that_are_killed_are_noticed_and_their_segments_swep
     used = {SHM / Path(line.split()[5]).name for line in maps if ".zenoh" in line}
     assert len(used) >= 2
     for reader in readers:
-        reader.kill()
+        reader.end()
     writer.reaches(lambda printed: not printed["wanted"])
-    writer.kill()
+    writer.end()
     assert until(lambda: segments.sweep() >= 0 and not any(path.exists() for path in used))
 
 
@@ -172,9 +154,8 @@ def unprivileged_net() -> Iterator[FramesNet]:
     """A run directory of a user whose limits count."""
     folder = Path(tempfile.mkdtemp(prefix="pebble-frames-"))  # pytest's own folders are closed to others
     os.chown(folder, UNPRIVILEGED_USER, -1)
-    net = FramesNet(folder)
-    yield net
-    net.close()
+    with FramesNet(folder) as net:
+        yield net
     shutil.rmtree(folder)
 
 
