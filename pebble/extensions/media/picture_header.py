@@ -75,6 +75,10 @@ class PictureSequence:
         self._last = header if self.complete else None
         return header
 
+    def interrupt(self) -> None:
+        """Treat the next picture as one that follows a missing picture."""
+        self.complete, self._last = False, None
+
 
 def _after(last: PictureHeader) -> int | None:
     """Return the number of the picture after ``last``; None if its encoding has no numbers."""

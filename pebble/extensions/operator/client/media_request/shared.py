@@ -61,6 +61,11 @@ class SharedRequest:
         self._closing = True
         self.wake()
 
+    async def wait_until_wanted(self) -> None:
+        while not self._wanted:
+            self._wakeup.clear()
+            await self._wakeup.wait()
+
     async def run(self, step: Callable[[], Awaitable[None]]) -> None:
         """Await ``step`` twice a second, and soon after a wake, until the medium was not wanted for a while.
 
