@@ -65,6 +65,7 @@ OURS: Final[Mapping[str, tuple[str, ...]]] = {
     "pebble.services.serial_mcu_bridge.imu": (),
     "pebble.services.serial_mcu_bridge.pebble_serial_v1": (),
     "pebble.services.serial_mcu_bridge.devices": (),
+    "pebble.extensions.foxglove": (),
     "pebble.extensions.metrics": (),
     "pebble.extensions.calibrate": (),
     "pebble.extensions.lab": (),

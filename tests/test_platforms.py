@@ -27,6 +27,7 @@ MODULES = (
         "pebble.transports.mqtt.transport",
         "pebble.extensions.operator.client.media_receiver",
     ),
+    *("pebble.extensions.foxglove.command", "pebble.extensions.foxglove.run"),
 )
 
 

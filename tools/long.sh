@@ -22,7 +22,7 @@ make long PART=ros1       install Debian's rosmaster, rospy and roscpp where pos
 make long PART=metrics    install Prometheus where possible, and have its promtool judge alerts and metrics, a minute
 make long PART=firmware   measure the firmware's use of each board's memory in the real MicroPython
 make long PART=life       install, update, damage and remove packages on machines with a real systemd; root, 15 minutes
-make long PART=lowest     core, films and the demo with the lowest versions that pyproject.toml admits, ten minutes
+make long PART=lowest     core, films, Foxglove and the demo with the lowest versions that pyproject.toml admits, ten minutes
 make long PART=packages   known vulnerabilities of all packages, from OSV, and build/sbom.cdx.json
 END
 }
@@ -97,7 +97,7 @@ lowest)
     # Other versions of msgspec list the alternatives of a schema in another order.
     $python -m pytest --workers 4 -m "not page and not thorough" --ignore tests/ext \
         --deselect tests/config/test_schema.py::test_the_schema_is_one_and_up_to_date_and_names_no_folder_of_this_machine tests
-    $python -m pytest --workers 2 -m "not page and not thorough" tests/ext/recordings tests/ext/operator
+    $python -m pytest --workers 2 -m "not page and not thorough" tests/ext/recordings tests/ext/foxglove tests/ext/operator
     $python -m pebble.cli demo --seconds 26
     ;;
 packages)

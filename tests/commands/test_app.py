@@ -124,6 +124,7 @@ UNTIL_ENDED = [
     [["sim", "goob", "--link", "goob"]],
     [["web", *_AT, "--port", "0", "--people", "people"]],
     [["record", *_AT, "--into", "recordings"]],
+    [["foxglove", *_AT, "--port", "0"]],
     [["exporter", *_AT, "--port", "0"]],
     [["fleet", "hub", "HUB"]],
     [["topic", "echo", "a/b", *_AT], _PUBLISH],

@@ -10,7 +10,8 @@ from pathlib import Path
 import cv2
 
 from tests.commands.command_line import Run, config_file
-from tests.ext.av.media_rig import HEIGHT, WIDTH, Filming, client
+from tests.ext.av.media_rig import HEIGHT, WIDTH, Filming
+from tests.ext.foxglove.live import client
 from tests.ext.page.media.robots import PictureRobot
 from tests.support import Broker, beside, until
 
@@ -35,7 +36,7 @@ def test_a_picture_is_of_the_local_camera(run: Run, broker: Broker, tmp_path: Pa
 def test_with_an_address_it_is_the_first_that_comes_and_no_more_are_wanted(
     run: Run, broker: Broker, tmp_path: Path
 ) -> None:
-    robot, file = PictureRobot(transport=client("robot", broker.port)), tmp_path / "view.png"
+    robot, file = PictureRobot(transport=client(broker)), tmp_path / "view.png"
     robot.mute = True  # what it loses is asked for again
 
     def hear() -> None:
