@@ -14,6 +14,7 @@ from pebble.extensions.media.video import VIDEO_ENCODINGS, VideoEncoder, make_en
 from pebble.runtime.connections import remote_transport
 from pebble.runtime.parent import requested_encoding
 from pebble.runtime.service import Service, every, on
+from pebble.runtime.source_check import SourceCheck
 from pebble.services.camera_publisher.camera_reader import CameraReader
 from pebble.services.camera_publisher.frame_selector import KeyframeRequests
 from pebble.services.camera_publisher.rate_control import RateController, wire_size
@@ -24,6 +25,8 @@ from pebble.transports.counters import in_words
 _FPS = 15.0  # where the config names none; the camera's own default
 _POLL_S = 0.02  # between two measurements while a picture is in flight
 _QUIET_S = 2.0  # without a frame before that is reported
+_BLACK, _DARK = "black", 24  # of 255: noise, and what some cameras call black
+_STEP = 8  # pixels, between those that are looked at
 _WORST_QUALITY = 3  # of a JPEG: below it nothing gets smaller
 
 
@@ -44,6 +47,7 @@ class CameraPublisher(Service):
         self._camera_at = now  # when its last frame came
         self._polling = False  # the next call of _poll is planned
         self._problem = ""  # why a picture was not sent, or not as requested
+        self._blackness = SourceCheck()  # for how long all pictures are black, see _black
         self._meter, self._keyframes = RateMeter(), KeyframeRequests()
         self._picture_topic = self.addresses[CAMERA].topic
         self._remote = remote_transport(self.config, "camera-publisher")
@@ -111,6 +115,7 @@ class CameraPublisher(Service):
         self._rate.connection_lost()
         self._keyframes.require()
         self._meter.clear()
+        self._blackness.clear()
         self._camera_at = self.clock()
         self._reader.enabled = self._remote.state is State.CONNECTED
         self._report()
@@ -148,6 +153,8 @@ class CameraPublisher(Service):
         picture = self._shape.picture(frame, self._rate.step.size)
         payload = self._encode(picture, frame.info.captured_ms)
         now = self.clock()
+        # SourceCheck measures how long a value stays the same. Black pictures have one; others the time, always new.
+        self._blackness.take(_BLACK if is_black(picture) else now, now)
         if not frame.valid():
             self._throw_away("overwritten")  # by the next frame, while it was encoded
         elif not self._remote.publish(self._picture_topic, payload, qos=QoS.LATEST):
@@ -192,6 +199,7 @@ class CameraPublisher(Service):
             bitrate=round(bitrate),
             dropped=sum(self.counters[why] for why in ("held_back", "overwritten", "refused", "failed")),
             reduced=str(self._rate.step) or None,
+            problem=self._black if self._reader.enabled else None,
             last_error=self._trouble() or None,
         )
         self.publish(MEDIA_REPORT, report, program=self.name)
@@ -210,4 +218,13 @@ class CameraPublisher(Service):
         quiet_s = self.clock() - self._camera_at
         if not self._reader.problem and quiet_s > _QUIET_S:
             return f"no frame from the camera for {quiet_s:.0f} s"
-        return self._reader.problem or self._problem
+        return self._reader.problem or self._black or self._problem
+
+    @property
+    def _black(self) -> str | None:
+        return f"shows only black since {self._blackness.same_s:.0f} s" if self._blackness.repeats else None
+
+
+def is_black(picture: Pixels) -> bool:
+    """True if the picture is all black, as with a lid on the lens."""
+    return bool(picture[::_STEP, ::_STEP].max() <= _DARK)

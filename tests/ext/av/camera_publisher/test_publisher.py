@@ -178,6 +178,19 @@ def test_after_a_bad_frame_comes_a_full_picture(
     assert [picture is not None and picture.keyframe for picture in pictures][2]
 
 
+@pytest.mark.parametrize(("level", "black"), [(12, True), (60, False)])
+def test_pictures_that_are_only_black_are_a_problem(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, level: int, black: bool
+) -> None:
+    monkeypatch.setattr("pebble.runtime.source_check.REPEATS_S", 0.01)
+    for _ in range(3):
+        bench.show(data=np.full(48 * 64 * 3, level, np.uint8))
+        time.sleep(0.01)
+    report = "media-report/camera_publisher"
+    assert until(lambda: "json 64x48" in bench.robot.newest(report).get("doing", ""))
+    assert bench.robot.newest(report).get("problem") == ("shows only black since 0 s" if black else None)
+
+
 def test_without_h264_there_is_a_problem_and_json_is_sent(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     def without_av(name: str, **options: Any) -> Any:
         if name == "h264":
