@@ -13,6 +13,7 @@ from pebble.extensions.media.frames import FrameWriter
 from pebble.runtime.service import Service, every, on
 from pebble.services.av_daemon import sources
 from pebble.services.av_daemon.config import AvDaemon as AvDaemonSection
+from pebble.services.av_daemon.health import Asked
 from pebble.services.av_daemon.stream import Stream
 
 CAMERA, MICROPHONE = "camera", "microphone"  # the names of the streams
@@ -54,11 +55,11 @@ class AvDaemon(Service):
     def start(self) -> None:
         options, now = self.config.section(AvDaemonSection), self.clock()
         if options.video.enabled:
-            computed = options.video.backend == "synthetic"
-            self._open(CAMERA, sources.picture_bytes(options), sources.camera(options, now), computed=computed)
+            asked = sources.asked_of_camera(options.video)
+            self._open(CAMERA, sources.picture_bytes(options), sources.camera(options, now), asked)
         if options.audio.enabled:
-            computed = options.audio.source == "synthetic"
-            self._open(MICROPHONE, sources.chunk_bytes(options), sources.microphone(options, now), computed=computed)
+            asked = sources.asked_of_microphone(options.audio)
+            self._open(MICROPHONE, sources.chunk_bytes(options), sources.microphone(options, now), asked)
 
     def stop(self) -> None:
         for stream in self._streams:
@@ -102,12 +103,12 @@ class AvDaemon(Service):
             self._published, self._published_at = value, now
             self.publish(MEDIA_STATUS, MediaStatus(t=int(time.time() * 1000), value=value))
 
-    def _open(self, name: str, size: int, open_source: sources.Opener, *, computed: bool) -> None:
+    def _open(self, name: str, size: int, open_source: sources.Opener, asked: Asked | None) -> None:
         writer = FrameWriter(self.config.run_dir(), name, capacity=size)
         writer.open()
         self.on_stop(writer.close)
         self._writers.append(writer)
-        self._streams.append(Stream(name, writer, open_source, computed=computed))
+        self._streams.append(Stream(name, writer, open_source, asked=asked))
 
 
 def _states(value: dict[str, MediaReport]) -> str:

@@ -11,11 +11,12 @@ from msgspec.structs import replace
 from pebble.errors import DeviceError, PayloadError
 from pebble.extensions.media.frames.frame import picture
 from pebble.services.av_daemon.alsa import CHUNK_S, AlsaMicrophone
-from pebble.services.av_daemon.config import AvDaemon
+from pebble.services.av_daemon.config import AvDaemon, CameraCapture, Microphone
+from pebble.services.av_daemon.health import Asked
 from pebble.services.av_daemon.libcamera import LibcameraCamera
 from pebble.services.av_daemon.source import Bytes, Capture, Source, opencv
 from pebble.services.av_daemon.synthetic import SyntheticCamera, SyntheticMicrophone, WorldCamera
-from pebble.services.av_daemon.v4l2 import V4l2Camera
+from pebble.services.av_daemon.v4l2 import V4l2Camera, is_device
 
 Opener: TypeAlias = Callable[[], Source]
 
@@ -41,6 +42,23 @@ def microphone(options: AvDaemon, start: float) -> Opener:
     if options.audio.source == "synthetic":
         return lambda: SyntheticMicrophone(options.audio, start)
     return lambda: AlsaMicrophone(options)
+
+
+def asked_of_camera(video: CameraCapture) -> Asked | None:
+    """Return the rate and size that a camera is asked for; None for a synthetic camera.
+
+    For a file or a network stream, which cannot be asked, it is ``Asked()``: any rate and size.
+    """
+    if video.backend == "synthetic":
+        return None
+    if video.backend == "v4l2" and not is_device(video.device):
+        return Asked()
+    width, height = (video.height, video.width) if video.rotate_degrees % 180 else (video.width, video.height)
+    return Asked(video.fps, width, height)
+
+
+def asked_of_microphone(audio: Microphone) -> Asked | None:
+    return None if audio.source == "synthetic" else Asked(1 / CHUNK_S)
 
 
 def picture_bytes(options: AvDaemon) -> int:

@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from pebble.contract.payloads import MediaReport
 from pebble.extensions.media.frames import FrameWriter
 from pebble.services.av_daemon.capturer import Capturer
-from pebble.services.av_daemon.health import FIRST_DELAY_S, Health
+from pebble.services.av_daemon.health import FIRST_DELAY_S, Asked, Health
 from pebble.services.av_daemon.source import Source
 
 log = logging.getLogger(__name__)
@@ -21,7 +21,7 @@ _HUNG_LIMIT = 3  # threads whose device never answers, before no more are starte
 class Stream:
     """The stream. All methods are for the service's thread. Call ``poll`` now and then.
 
-    ``first_delay_s``, ``computed``: see :class:`Health`; ``rest_s``: without a reader, until the device is closed.
+    ``first_delay_s``, ``asked``: see :class:`Health`; ``rest_s``: without a reader, until the device is closed.
     """
 
     def __init__(
@@ -32,17 +32,17 @@ class Stream:
         *,
         first_delay_s: float = FIRST_DELAY_S,
         rest_s: float = REST_S,
-        computed: bool = False,
+        asked: Asked | None = None,
     ) -> None:
         self.name, self._writer, self._open_source, self._rest_s = name, writer, open_source, rest_s
-        self._health = Health(first_delay_s, computed=computed)
-        self._told = False  # the problem of its frames was logged
+        self._health = Health(first_delay_s, asked)
+        self._told: frozenset[str] = frozenset()  # kinds of problems that were logged, and last
         self._capturer = self._start(0.0)
         self._hung: list[Capturer] = []  # abandoned threads that have not ended, as their device does not answer
 
     def poll(self, now: float) -> None:
         """Abandon a device that is overdue, and open it again in another thread; log problems of its frames."""
-        self._tell(self._health.problem)
+        self._tell(self._health.problems)
         self._hung = [capturer for capturer in self._hung if capturer.alive]
         if len(self._hung) >= _HUNG_LIMIT or not self._health.overdue(now):
             return
@@ -52,12 +52,12 @@ class Stream:
         log.warning("%s: the device does not answer; it is opened again in %g s", self.name, delay)
         self._capturer = self._start(delay)
 
-    def _tell(self, problem: str) -> None:
-        if problem and not self._told:
-            log.warning("%s: it %s", self.name, problem)
-        if self._told and not problem:
+    def _tell(self, problems: dict[str, str]) -> None:
+        for kind in problems.keys() - self._told:
+            log.warning("%s: it %s", self.name, problems[kind])
+        if self._told and not problems:
             log.info("%s: what it gives is as it should be again", self.name)
-        self._told = bool(problem)
+        self._told = frozenset(problems)
 
     def report(self, now: float) -> MediaReport:
         report = self._health.report(now)

@@ -22,7 +22,7 @@ from pebble.extensions.media.frames import FrameInfo, FrameReader
 from pebble.extensions.media.frames.frame import picture
 from pebble.extensions.media.speech import PERIOD_S, Speech
 from pebble.services.av_daemon import health, sources
-from pebble.services.av_daemon.health import NOTHING, Health
+from pebble.services.av_daemon.health import NOTHING, Asked, Health
 from pebble.services.av_daemon.service import Reports
 from pebble.services.av_daemon.source import Capture, Source
 from pebble.services.av_daemon.stream import Stream
@@ -48,9 +48,9 @@ class Streams:
 
     def __call__(
         self, writer: Remembering, open_source: Callable[[], Source], *, delay: float = 0.05, rest_s: float = 0.2,
-        computed: bool = True,
+        asked: Asked | None = None,
     ) -> Stream:  # fmt: skip
-        stream = Stream("camera", writer, open_source, first_delay_s=delay, rest_s=rest_s, computed=computed)
+        stream = Stream("camera", writer, open_source, first_delay_s=delay, rest_s=rest_s, asked=asked)
         self._all.append(stream)
         return stream
 
@@ -272,24 +272,27 @@ class TestHealth:
         assert not device.overdue(1e9)
 
     @pytest.mark.parametrize(
-        ("info", "computed", "content", "problem"),
+        ("info", "asked", "hz", "content", "problem"),
         [
-            (PICTURE, False, None, None),
-            (PICTURE, False, [7], "shows the same picture since 11 s"),
-            (PICTURE, False, [1, 2, 3, 4], "shows the same pictures again and again since 11 s"),
-            (PICTURE, True, [7], None),
-            (SOUND, False, [7], "gives the same sound since 11 s"),
-            (SOUND, False, [NOTHING], "gives only zeros, as one that is muted or unplugged, since 11 s"),
+            (PICTURE, Asked(15, 640, 480), 15, None, None),
+            (PICTURE, Asked(15, 640, 480), 14, 7, "shows the same picture since 11 s"),
+            (PICTURE, Asked(15, 640, 480), 15, [1, 2, 3, 4], "shows the same pictures again and again since 11 s"),
+            (PICTURE, None, 10, 7, None),
+            (PICTURE, Asked(15, 480, 640), 15, None, "gives pictures of 640x480 where 480x640 were asked"),
+            (PICTURE, Asked(15, 640, 480), 7, None, "gives 7.0 pictures a second where 15 were asked"),
+            (PICTURE, Asked(), 99, None, None),
+            (SOUND, Asked(50), 50, NOTHING, "gives only zeros, as one that is muted or unplugged, since 11 s"),
+            (SOUND, Asked(50), 138, None, "gives 44160 samples a second where 16000 were asked"),
         ],
     )
     def test_frames_that_come_in_time_may_show_nothing(
-        self, info: FrameInfo, computed: bool, content: list[int | str] | None, problem: str | None
+        self, info: FrameInfo, asked: Asked | None, hz: int, content: int | str | list[int] | None, problem: str | None
     ) -> None:
-        device = Health(2.0, computed=computed)
+        device = Health(2.0, asked)
         device.opening(100.0)
-        for number in range(11 * 15 + 2):
-            new = 1000 + number if content is None else content[number % len(content)]
-            device.frame(info, 100 + number / 15, content=new)
+        for number in range(11 * hz + 2):
+            new = content[number % len(content)] if isinstance(content, list) else content
+            device.frame(info, 100 + number / hz, content=1000 + number if new is None else new)
         found = device.report(111.0)
         assert (found.problem, found.last_error, found.doing) == (problem, problem, "runs")
         device.failed("unplugged")
@@ -312,7 +315,7 @@ def test_a_frozen_picture_is_noticed_although_its_header_changes(
         return Capture(FrameInfo(format="mjpeg"), data.size, data)
 
     monkeypatch.setattr(device, "grab", grab)
-    stream = streams(Remembering(), device, computed=False)
+    stream = streams(Remembering(), device, asked=Asked())
     assert until(lambda: len(pictures) > 200)
     assert until(lambda: report(stream).problem) if frozen else not report(stream).problem
 

@@ -28,7 +28,7 @@ from pebble.extensions.media.speech import Speech
 from pebble.services.av_daemon import alsa, capture_program, sources
 from pebble.services.av_daemon.alsa import AlsaMicrophone
 from pebble.services.av_daemon.capture_program import CaptureProgram
-from pebble.services.av_daemon.health import Health
+from pebble.services.av_daemon.health import Asked, Health, RateCheck
 from pebble.services.av_daemon.libcamera import JpegSplitter, LibcameraCamera
 from pebble.services.av_daemon.source import Capture, Source
 from pebble.services.av_daemon.sources import Rotated
@@ -190,6 +190,11 @@ class TestOpenCv:
         with pytest.raises(DeviceError, match="gives no picture"):
             opened[0].grab()
 
+    def test_only_a_camera_of_this_machine_is_asked_for_a_rate_and_a_size(self) -> None:
+        devices = ("0", "/dev/video2", "film.avi", "rtsp://127.0.0.1/door")
+        asked = [sources.asked_of_camera(options(video={**SMALL, "device": device}).video) for device in devices]
+        assert asked == [Asked(30, 320, 240), Asked(30, 320, 240), Asked(), Asked()]
+
     @pytest.mark.parametrize("device", ["99", "rtsp://someone:s3cret@127.0.0.1:1/door?key=s3cret"])
     def test_what_is_not_there_is_an_error_without_a_password(self, device: str) -> None:
         with pytest.raises(DeviceError, match="cannot open") as raised:
@@ -344,3 +349,13 @@ def test_the_error_without_a_world_names_the_command_that_starts_it(path: Path) 
         camera_of(path)
     health = Health(2.0)
     assert [health.failed("absent", expected=True) for _ in range(4)] == [2.0] * 4, "it is looked for all the time"
+
+
+@pytest.mark.parametrize(("hz", "asked", "found"), [(13, 15, None), (10, 15, 10), (19, 15, 19), (3, 0, None)])
+def test_rates(hz: int, asked: float, found: float | None) -> None:
+    check = RateCheck(asked)
+    for number in range(2 * hz):
+        check.count(1, 100 + number / hz / 10)  # a start in a hurry
+    for number in range(13 * hz):
+        check.count(1, 102 + number / hz)
+    assert check.wrong_hz == (None if found is None else pytest.approx(found, rel=0.05))
