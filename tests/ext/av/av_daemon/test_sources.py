@@ -29,7 +29,8 @@ from pebble.services.av_daemon import alsa, capture_program, sources
 from pebble.services.av_daemon.alsa import AlsaMicrophone
 from pebble.services.av_daemon.capture_program import CaptureProgram
 from pebble.services.av_daemon.health import Asked, Health, RateCheck
-from pebble.services.av_daemon.libcamera import JpegSplitter, LibcameraCamera
+from pebble.services.av_daemon.jpeg_splitter import JpegSplitter
+from pebble.services.av_daemon.libcamera import LibcameraCamera
 from pebble.services.av_daemon.source import Capture, Source
 from pebble.services.av_daemon.sources import Rotated
 from pebble.services.av_daemon.synthetic import Pacer, SyntheticCamera, SyntheticMicrophone
@@ -69,11 +70,15 @@ def alsa_microphone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, opened: lis
 
 class TestLibcamera:
     def test_pictures_come_and_their_counter_advances(
-        self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, opened: list[Source]
+        self,
+        monkeypatch: pytest.MonkeyPatch,
+        tmp_path: Path,
+        opened: list[Source],
+        caplog: pytest.LogCaptureFixture,
     ) -> None:
         """Also of the older program, and by another name of the backend."""
         Installed(monkeypatch, tmp_path, "libcamera-vid", "tests.fakes.fake_rpicam")
-        video = {**SMALL, "backend": "picamera2"}
+        video = {**SMALL, "backend": "picamera2", "capture_format": "yuyv"}
         camera = sources.camera(options(video=video), 0.0)()
         opened.append(camera)
         frames = [grabbed(camera) for _ in range(8)]
@@ -84,6 +89,7 @@ class TestLibcamera:
         assert (info.width, info.height) == (320, 240)
         assert (data[:2].tobytes(), data[-2:].tobytes()) == (b"\xff\xd8", b"\xff\xd9")
         assert (info.format, info.stride) == ("mjpeg", 0), "its own JPEG is passed on as it is"
+        assert "capture_format yuyv does nothing" in caplog.text
         pictures = TestJpegSplitter.PICTURES
         monkeypatch.setattr(LibcameraCamera, "read", lambda _self: b"".join(pictures))
         capture = camera.grab()
