@@ -1,4 +1,4 @@
-"""What a client writes and reads is what paho writes and reads; what it does where no broker would show it; its id."""
+"""What a client writes and reads is what paho writes and reads; how much it may send; its id."""
 
 from __future__ import annotations
 
@@ -8,9 +8,7 @@ import select
 import socket
 import struct
 import threading
-import time
 from collections.abc import Callable, Iterator
-from contextlib import closing
 from itertools import product
 from typing import Any
 
@@ -19,18 +17,14 @@ from paho.mqtt.client import Client as PahoClient
 from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
-from paho.mqtt.reasoncodes import ReasonCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
-from pebble.transports import MqttSettings
 from pebble.transports.base import Message, QoS
-from pebble.transports.hosts import addresses_of
-from pebble.transports.mqtt import packets, reasons
-from pebble.transports.mqtt.client import Client, Opening, SendQuota
+from pebble.transports.mqtt import packets
+from pebble.transports.mqtt.client import SendQuota
 from pebble.transports.mqtt.client_ids import unique
 from pebble.transports.mqtt.packets import ANY_QOS, MAX_PACKET, RETAIN, Accepted, Filter, MalformedError, Reader
 from tests.kit.mqtt_bytes import packet
-from tests.support import until
 
 NO_QUOTA = SendQuota(lambda _packet: None)
 V3, V5 = MQTTProtocolVersion.MQTTv311, MQTTProtocolVersion.MQTTv5
@@ -315,104 +309,22 @@ class TestRead:
         assert 500 < refused < 2000
 
 
-def test_reasons_are_called_as_paho_calls_them() -> None:
-    for code in range(0x80, 0xA3):
-        name = ReasonCode(PacketTypes.DISCONNECT, identifier=0x80).names.get(code)
-        if name is not None:
-            assert reasons.words(code).lower() == next(iter(name)).lower()
+def test_no_more_is_in_flight_than_the_broker_takes() -> None:
+    sent = list[bytes]()
+    quota = SendQuota(sent.append)
+    reader = Reader(Noted(), quota, modern=True)
 
+    def receives(data: bytes) -> list[bytes]:
+        reader.feed(data)
+        reader.read(9)
+        return sent
 
-# -- against the other end of its socket
-
-
-RECEIVE_MAXIMUM_2 = packet(0x20, b"\0\0\3\x21\0\2")
-
-
-class Pair:
-    """A client, and the other end of its connection."""
-
-    def __init__(self) -> None:
-        with socket.create_server(("127.0.0.1", 0)) as server:
-            settings = MqttSettings(host="127.0.0.1", port=server.getsockname()[1], protocol="5")
-            opening = Opening("client", settings, None, None, addresses_of(settings.host, settings.port)[0])
-            self.client = Client(opening, Noted(), bridge=False)
-            self.client.open()
-            self.other, _ = server.accept()
-        self.written()  # CONNECT
-
-    def written(self) -> bytes:
-        """What has arrived at the other end."""
-        select.select([self.other], [], [], 1)
-        self.other.setblocking(False)
-        parts = []
-        try:
-            while part := self.other.recv(1 << 20):
-                parts.append(part)
-        except BlockingIOError:
-            pass
-        return b"".join(parts)
-
-    def sends(self, data: bytes) -> None:
-        """The other end does, and the client reads it."""
-        self.other.setblocking(True)
-        self.other.sendall(data)
-        assert until(lambda: self.client.receive() == len(data))
-        self.client.read(64)
-
-    def close(self) -> None:
-        self.client.close()
-        self.other.close()
-
-
-@pytest.fixture
-def pair() -> Iterator[Pair]:
-    with closing(Pair()) as pair:
-        yield pair
-
-
-def publish(client: Client, number: int) -> None:
-    client.publish("a", b"%d" % number, 1, retain=False, expires_s=None)
-
-
-def test_no_more_is_in_flight_than_the_broker_takes(pair: Pair) -> None:
-    pair.sends(RECEIVE_MAXIMUM_2)
-    for number in range(5):
-        publish(pair.client, number)
-    client_sent = [
-        packets.publish("a", b"%d" % n, 1, n + 1, retain=False, modern=True, expires_s=None) for n in range(5)
-    ]
-    assert pair.written() == b"".join(client_sent[:2])
-    pair.sends(packet(0x40, b"\0\1"))
-    assert pair.written() == client_sent[2]
-    pair.sends(packet(0x40, b"\0\2") + packet(0x40, b"\0\3"))
-    assert pair.written() == b"".join(client_sent[3:])
-    pair.sends(packet(0x40, b"\0\4") + 5 * packet(0x40, b"\0\5"))  # more answers than were asked for allow no more
-    for number in range(3):
-        publish(pair.client, number)
-    assert len(pair.written()) == 2 * len(client_sent[0])
-
-
-def test_a_client_that_leaves_closes_after_the_other_side(pair: Pair) -> None:
-    """Else what that sends meanwhile has the connection reset, and a proxy may lose DISCONNECT with it."""
-    parts = list[bytes]()
-
-    def end() -> None:
-        while not b"".join(parts).endswith(packets.DISCONNECT):
-            parts.append(pair.other.recv(4096))
-        for _ in range(3):
-            pair.other.sendall(b"\xd0\0")
-            time.sleep(0.01)
-        parts.append(pair.other.recv(4096))  # a reset would raise
-        pair.other.close()
-
-    pair.other.setblocking(True)
-    other = threading.Thread(target=end)
-    other.start()
-    publish(pair.client, 1)
-    pair.client.disconnect()
-    assert pair.client.socket is None
-    other.join()
-    assert parts[-1] == b""
+    receives(packet(0x20, b"\0\0\3\x21\0\2"))  # CONNACK: Receive Maximum 2
+    assert [quota.takes(b"%d" % number) for number in range(5)] == [True, True, False, False, False]
+    assert receives(packet(0x40, b"\0\1")) == [b"2"]
+    assert receives(packet(0x40, b"\0\2") + packet(0x40, b"\0\3")) == [b"2", b"3", b"4"]
+    receives(packet(0x40, b"\0\4") + 5 * packet(0x40, b"\0\5"))  # more answers than were asked for allow no more
+    assert [quota.takes(b"x") for _ in range(3)] == [True, True, False]
 
 
 @pytest.mark.parametrize(
