@@ -10,6 +10,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from enum import Enum
 from types import TracebackType
 from typing import Any, Self
 
@@ -21,8 +22,6 @@ from pebble.transports.counters import Counters
 from pebble.transports.message import Message as Message
 from pebble.transports.message import QoS as QoS
 from pebble.transports.own_retained import OwnRetained
-from pebble.transports.state import State as State
-from pebble.transports.state import StateChanges, Watcher
 from pebble.transports.topics import REMEMBERED_LENGTH, check_filter, check_topic, matches
 
 log = logging.getLogger(__name__)
@@ -36,6 +35,37 @@ _HANDLER_END_S = 1.0  # how long closing waits for handlers that are running
 _TRIED_S = 0.02  # how soon `open` notices that all addresses were tried
 _NAMED = 3  # subscriptions in one line
 _WARNING_PERIOD_S = 5.0  # between two log lines about the same overflowing subscription
+
+
+class State(Enum):
+    CLOSED = "closed"
+    CONNECTING = "connecting"
+    CONNECTED = "connected"
+
+
+Watcher = Callable[[State], None]
+
+
+class StateChanges:
+    """A notifier: it tells watchers each change of a transport's state, in order. Any thread may use it."""
+
+    def __init__(self, client_id: str) -> None:
+        self.lock = threading.RLock()  # held while the state changes and its watchers are called
+        self._client_id = client_id
+        self.connected = threading.Event()
+        self.watchers: list[Watcher] = []
+
+    def notify(self, state: State) -> None:
+        """Tell the watchers the new state. Call it with :attr:`lock` held."""
+        if state is State.CONNECTED:
+            self.connected.set()
+        else:
+            self.connected.clear()
+        for watcher in list(self.watchers):
+            try:
+                watcher(state)
+            except Exception:  # foreign code on our thread
+                log.exception("a state watcher of %s failed", self._client_id)
 
 
 class Outgoing(Struct, frozen=True):

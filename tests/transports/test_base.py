@@ -19,11 +19,11 @@ from pebble.transports.ages import MessageAges
 from pebble.transports.base import Subscriptions
 from pebble.transports.bounds import BoundedQueue, BoundedTable
 from pebble.transports.counters import Counters
+from pebble.transports.credentials import make_context
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from pebble.transports.own_retained import OwnRetained
 from pebble.transports.renewed import Renewed
 from pebble.transports.settings import TlsSettings
-from pebble.transports.tls import make_context
 from pebble.transports.topics import check_topic
 from pebble.transports.zenoh.keymap import key_to_topic, topic_to_key
 from tests.support import ROOT, WAIT_S, until

@@ -17,9 +17,9 @@ from pebble.errors import PebbleError, TransportError
 from pebble.extensions.fleet import certificates
 from pebble.extensions.page.app import create_app
 from pebble.extensions.page.setting import WebSettings
+from pebble.transports.credentials import no_password
 from pebble.transports.renewed import Renewed
 from pebble.transports.socket_holders import why_not
-from pebble.transports.tls import no_password
 
 _LARGEST_MESSAGE = 64 * 1024
 _END_S = 1
