@@ -475,6 +475,7 @@ def test_T12_reconnects_resubscribes_and_notifies_watchers(net: Net, base: str) 
     for turn in range(2):
         with reconnecting(client, sender):
             net.restart_network()
+        assert client.was_ended
         assert sender.publish(base, b"%d" % turn, qos=DELIVERED)
         assert until(lambda: len(received.payloads) == turn + 1)  # noqa: B023
     assert states == [State.CONNECTING, State.CONNECTED] * 2
