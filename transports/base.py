@@ -46,28 +46,6 @@ class State(Enum):
 Watcher = Callable[[State], None]
 
 
-class StateChanges:
-    """A notifier: it tells watchers each change of a transport's state, in order. Any thread may use it."""
-
-    def __init__(self, client_id: str) -> None:
-        self.lock = threading.RLock()  # held while the state changes and its watchers are called
-        self._client_id = client_id
-        self.connected = threading.Event()
-        self.watchers: list[Watcher] = []
-
-    def notify(self, state: State) -> None:
-        """Tell the watchers the new state. Call it with :attr:`lock` held."""
-        if state is State.CONNECTED:
-            self.connected.set()
-        else:
-            self.connected.clear()
-        for watcher in list(self.watchers):
-            try:
-                watcher(state)
-            except Exception:  # foreign code on our thread
-                log.exception("a state watcher of %s failed", self._client_id)
-
-
 class Outgoing(Struct, frozen=True):
     """The messages that a transport has accepted and not delivered yet; not the contract's direction ``outgoing``.
 
@@ -293,7 +271,9 @@ class Transport(ABC):
         #: One line that explains why there is no connection; empty while there is one.
         self.problem = ""
         self._state = State.CLOSED
-        self._changes = StateChanges(client_id)
+        self._changing = threading.RLock()  # held while the state changes and its watchers are called
+        self._connected = threading.Event()
+        self._watchers: list[Watcher] = []
         self._subscriptions = Subscriptions()
         self._publishing = threading.RLock()  # one publish at a time: the order of calls is the order per topic (T3)
         self._own = OwnRetained(self.counters)
@@ -338,7 +318,7 @@ class Transport(ABC):
 
     def on_state(self, watcher: Watcher) -> None:
         """Call ``watcher`` on every change of state, in order, on a thread of the transport. It must not wait."""
-        self._changes.watchers.append(watcher)
+        self._watchers.append(watcher)
 
     def open(self, timeout: float = 5.0) -> Self:
         """Start connecting, and wait up to ``timeout`` seconds for success.
@@ -355,14 +335,14 @@ class Transport(ABC):
         except TransportError:
             self._set_state(State.CLOSED)
             raise
-        connected = self._changes.connected.wait(timeout)
+        connected = self._connected.wait(timeout)
         while timeout and not connected and self.untried and self.state is State.CONNECTING:
-            connected = self._changes.connected.wait(_TRIED_S)
+            connected = self._connected.wait(_TRIED_S)
         return self
 
     def close(self) -> None:
         """Disconnect and free all resources. The will is published, so that others receive it as after a crash."""
-        with self._changes.lock:
+        with self._changing:
             if self._state is State.CLOSED:
                 return
             connected = self._state is State.CONNECTED
@@ -485,14 +465,21 @@ class Transport(ABC):
 
     def _set_state(self, state: State) -> None:
         """Set the state, and notify the watchers of a change. A closed transport stays closed until it is opened."""
-        with self._changes.lock:
+        with self._changing:
             if state is self._state or (self._state is State.CLOSED and state is State.CONNECTED):
                 return
             if state is State.CONNECTED:
                 self.problem = ""
                 self.counters.add("connected")
+                self._connected.set()
+            else:
+                self._connected.clear()
             self._state = state
-            self._changes.notify(state)
+            for watcher in list(self._watchers):
+                try:
+                    watcher(state)
+                except Exception:  # foreign code on our thread
+                    log.exception("a state watcher of %s failed", self.client_id)
 
     def _renew(self) -> None:
         """Begin a new connection; backends call this before its first message is offered."""
