@@ -471,10 +471,11 @@ class Transport(ABC):
             if state is State.CONNECTED:
                 self.problem = ""
                 self.counters.add("connected")
+            self._state = state
+            if state is State.CONNECTED:
                 self._connected.set()
             else:
                 self._connected.clear()
-            self._state = state
             for watcher in list(self._watchers):
                 try:
                     watcher(state)
