@@ -76,7 +76,7 @@ MEANINGS: list[tuple[Channel, bytes, Any]] = [
         (c.OUTLET_COMMAND, raw, OutletCommand(on=True))
         for raw in (b'{"on": true}', b'{"value": {"on": true}, "on": 1}')
     ),
-    # drive values, whose numbers an independent reader reads below
+    # drive values, whose numbers are read below
     (c.DRIVE, b'{"x": 1, "t": 1710969600123, "origin": {"a": [1]}}', Drive(x=1, t=1710969600123)),
     # their source, their run, and how long they are valid
     (c.DRIVE, b'{"z": 1, "source": "autonomy", "run": 17}', Drive(z=1, source="autonomy", run=17)),
