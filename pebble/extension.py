@@ -143,7 +143,7 @@ class Extension(Struct, frozen=True, kw_only=True, eq=False):
     step: str = ""  # a function of the config: pebble.forwarding.observer.Step, which may refuse it
     requests: tuple[str, ...] = ()  # pebble.services.mqtt_bridge.own_requests.Requests, which the bridge fulfils
     uplink: str = ""  # pebble.services.mqtt_bridge.uplink.Uplink, where the link may be thin
-    private: str = ""  # pebble.forwarding.private_topics.PrivateTopics, by which its topics stay on the robot
+    private: str = ""  # pebble.forwarding.observer.PrivateTopics, by which its topics stay on the robot
     names: str = ""  # pebble.forwarding.names.Names, where a robot's operators are known by name
     accounts: str = ""  # pebble.transports.zenoh.hub.admission.Admission, where a hub has a file of access
     offers: str = ""  # a function of config and CapabilitiesValue, which it returns completed

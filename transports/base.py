@@ -10,6 +10,7 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from enum import Enum
 from types import TracebackType
 from typing import Any, Self
 
@@ -21,8 +22,6 @@ from pebble.transports.counters import Counters
 from pebble.transports.message import Message as Message
 from pebble.transports.message import QoS as QoS
 from pebble.transports.own_retained import OwnRetained
-from pebble.transports.state import State as State
-from pebble.transports.state import StateChanges, Watcher
 from pebble.transports.topics import REMEMBERED_LENGTH, check_filter, check_topic, matches
 
 log = logging.getLogger(__name__)
@@ -36,6 +35,15 @@ _HANDLER_END_S = 1.0  # how long closing waits for handlers that are running
 _TRIED_S = 0.02  # how soon `open` notices that all addresses were tried
 _NAMED = 3  # subscriptions in one line
 _WARNING_PERIOD_S = 5.0  # between two log lines about the same overflowing subscription
+
+
+class State(Enum):
+    CLOSED = "closed"
+    CONNECTING = "connecting"
+    CONNECTED = "connected"
+
+
+Watcher = Callable[[State], None]
 
 
 class Outgoing(Struct, frozen=True):
@@ -263,7 +271,9 @@ class Transport(ABC):
         #: One line that explains why there is no connection; empty while there is one.
         self.problem = ""
         self._state = State.CLOSED
-        self._changes = StateChanges(client_id)
+        self._changing = threading.RLock()  # held while the state changes and its watchers are called
+        self._connected = threading.Event()
+        self._watchers: list[Watcher] = []
         self._subscriptions = Subscriptions()
         self._publishing = threading.RLock()  # one publish at a time: the order of calls is the order per topic (T3)
         self._own = OwnRetained(self.counters)
@@ -308,7 +318,7 @@ class Transport(ABC):
 
     def on_state(self, watcher: Watcher) -> None:
         """Call ``watcher`` on every change of state, in order, on a thread of the transport. It must not wait."""
-        self._changes.watchers.append(watcher)
+        self._watchers.append(watcher)
 
     def open(self, timeout: float = 5.0) -> Self:
         """Start connecting, and wait up to ``timeout`` seconds for success.
@@ -325,14 +335,14 @@ class Transport(ABC):
         except TransportError:
             self._set_state(State.CLOSED)
             raise
-        connected = self._changes.connected.wait(timeout)
+        connected = self._connected.wait(timeout)
         while timeout and not connected and self.untried and self.state is State.CONNECTING:
-            connected = self._changes.connected.wait(_TRIED_S)
+            connected = self._connected.wait(_TRIED_S)
         return self
 
     def close(self) -> None:
         """Disconnect and free all resources. The will is published, so that others receive it as after a crash."""
-        with self._changes.lock:
+        with self._changing:
             if self._state is State.CLOSED:
                 return
             connected = self._state is State.CONNECTED
@@ -455,14 +465,22 @@ class Transport(ABC):
 
     def _set_state(self, state: State) -> None:
         """Set the state, and notify the watchers of a change. A closed transport stays closed until it is opened."""
-        with self._changes.lock:
+        with self._changing:
             if state is self._state or (self._state is State.CLOSED and state is State.CONNECTED):
                 return
             if state is State.CONNECTED:
                 self.problem = ""
                 self.counters.add("connected")
             self._state = state
-            self._changes.notify(state)
+            if state is State.CONNECTED:
+                self._connected.set()
+            else:
+                self._connected.clear()
+            for watcher in list(self._watchers):
+                try:
+                    watcher(state)
+                except Exception:  # foreign code on our thread
+                    log.exception("a state watcher of %s failed", self.client_id)
 
     def _renew(self) -> None:
         """Begin a new connection; backends call this before its first message is offered."""

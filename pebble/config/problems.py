@@ -53,7 +53,7 @@ class Notes:
 
 
 def _unused(retired: list[Note]) -> Iterator[str]:
-    """Yield lines such as ``video.{shm_size, io_mode}: no longer used, …``; many keys share one line."""
+    """Yield lines such as ``video.shm_size, video.io_mode: no longer used, …``; many keys share one line."""
     reasons = dict.fromkeys(note.text for note in retired)
     if len(reasons) > _FEW_REASONS:
         paths = (tuple(step for step in note.path if isinstance(step, str)) for note in retired)  # no places in lists
@@ -61,15 +61,8 @@ def _unused(retired: list[Note]) -> Iterator[str]:
         yield without_secrets(f"no longer used, delete them: {names}; `pebble check --keys` says what replaces each")
         return
     for reason in reasons:
-        keys_of: dict[Path, list[str]] = {}  # by the path of their section
-        for note in retired:
-            if note.text == reason:
-                keys_of.setdefault(note.path[:-1], []).append(str(note.path[-1]))
-        places = []
-        for section, keys in keys_of.items():
-            listed = keys[0] if len(keys) == 1 else f"{{{', '.join(keys)}}}"  # such as {shm_size, io_mode}
-            places.append(show_path((*section, listed)))
-        yield without_secrets(f"{', '.join(places)}: no longer used, {reason}")
+        places = ", ".join(show_path(note.path) for note in retired if note.text == reason)
+        yield without_secrets(f"{places}: no longer used, {reason}")
 
 
 def show_path(path: Path) -> str:

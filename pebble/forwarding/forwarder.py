@@ -15,9 +15,13 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 
 import msgspec
+from msgspec import UNSET
+from msgspec.structs import replace
 
-from pebble.contract import ESTOP, Kind
+from pebble.contract import DRIVE, ESTOP, Kind, codec
 from pebble.contract.names import NO_ACCOUNT
+from pebble.contract.payloads import SCRIPT, Drive
+from pebble.errors import PayloadError
 from pebble.forwarding.admission import Admission
 from pebble.forwarding.command_ages import STAMP, STAMP_LETTER, CommandAges, ends_something
 from pebble.forwarding.cycles import Cycles, Finding
@@ -27,7 +31,6 @@ from pebble.forwarding.publisher import Publisher
 from pebble.forwarding.retained_topics import RetainedTopics
 from pebble.forwarding.routing import Drop, Forward, Rules, Side, route
 from pebble.forwarding.side import Gate, Sides, SideState
-from pebble.forwarding.signatures import unsigned
 from pebble.forwarding.subjects import Subject, Subjects
 from pebble.runtime.rate_limit import RateLimitedLog
 from pebble.transports import Message, QoS, Transport
@@ -37,6 +40,7 @@ log = logging.getLogger(__name__)
 
 _LOGGED = 200  # characters of a topic
 _STOP = f"/{ESTOP.metric}".encode()
+_SCRIPT, _BACKSLASH = SCRIPT.encode(), 0x5C
 _NAMES = (Drop.UNNAMED, Drop.MISNAMED, Drop.UNREADABLE)  # where senders are checked: these are logged
 _BOUNDS = (Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN, Drop.LATE, Drop.CIRCULATES, Drop.SIGNED, *_NAMES)
 _WARNED = (Drop.TOO_LARGE, Drop.TOO_MANY, Drop.TOO_OFTEN)
@@ -391,6 +395,26 @@ class Forwarder:
 
     def _warn(self, drop: Drop, topic: str) -> None:
         self._quiet_log.warning(drop.name, "%s is not forwarded: %s", topic, drop.value)
+
+
+def unsigned(payload: bytes) -> bytes | None:
+    """Return a drive command without a script's signature, or the same object if it has none; None: it must not pass.
+
+    A signature names the script run that may drive, so it counts only if a program on the robot sends it. A signed
+    command from outside does not pass if it moves anything. A signed zero passes as a person's, and stops the motors.
+
+    Must be fast: a person's command is rarely decoded. JSON may spell SCRIPT, a script's source, with backslashes. A
+    payload with SCRIPT or a backslash that cannot be decoded does not pass: a board's parser may be more lenient.
+    """
+    if _BACKSLASH not in payload and _SCRIPT not in payload:
+        return payload
+    try:
+        drive: Drive = codec.decode(DRIVE, payload)
+    except PayloadError:
+        return None
+    if not drive.signed:
+        return payload
+    return None if drive.moves else codec.encode(DRIVE, replace(drive, source=UNSET, run=UNSET))
 
 
 def barrier(transport: Transport, filter_: str) -> None:

@@ -1,6 +1,6 @@
-"""Extensions' parts of the way between operators and a robot: steps that may refuse messages, and observers.
+"""Extensions' parts of the way between operators and a robot: steps that refuse messages, observers, private topics.
 
-Both are called on the threads that receive messages, and must not wait. No step is asked about an emergency stop.
+All are called on the threads that receive messages, and must not wait. No step is asked about an emergency stop.
 """
 
 import logging
@@ -52,6 +52,21 @@ class Observer:
 
     def unconfirmed(self, owner: str, stop: EstopCommand) -> None:
         """Note a stop that is no longer repeated although a motor owner has not confirmed it."""
+
+
+class PrivateTopics:
+    """The topics of one robot, below its ``base``, that never leave it: none, unless an extension publishes such."""
+
+    def __init__(self, base: str) -> None:
+        self.base = base
+
+    def stays(self, topic: str) -> bool:  # noqa: ARG002
+        """True if messages on ``topic`` must not be forwarded, in either direction."""
+        return False
+
+    def admit(self, message: Message) -> list[Message]:
+        """Return the robot's messages that may pass now: none, ``message``, or waiting ones before it as well."""
+        return [message]
 
 
 class Observers:

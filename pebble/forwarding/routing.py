@@ -69,7 +69,7 @@ class Forward(Struct, frozen=True):
     qos: QoS
     retain: bool
     urgent: bool
-    unsigned: bool = False  # a script's signature does not pass (see .signatures)
+    unsigned: bool = False  # a script's signature does not pass (see forwarder.unsigned)
     stamped: bool = False  # it may tell its own age (see .command_ages)
 
 

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING
 
 from pebble.config import Config, config_of_process
 from pebble.errors import PebbleError
-from pebble.launcher.announcer_pipe import Envelope, next_envelope
+from pebble.launcher.announcer_pipe import next_message
 from pebble.launcher.reactor import Reactor
 from pebble.runtime.connections import hub_settings, local_transport
 from pebble.runtime.parent import ALIVE_PERIOD_S, Notifier, set_log_level, set_up_logging
 from pebble.runtime.process import exit_at_the_latest
 from pebble.runtime.rate_limit import RateLimitedLog
-from pebble.transports import Message, State, Transport
+from pebble.transports import Message, Transport
 from pebble.transports.wakeup import WakeupPipe
 
 if TYPE_CHECKING:
@@ -35,12 +35,11 @@ log = logging.getLogger(__name__)
 
 
 class Announcer:
-    """A publisher of the messages on ``pipe``. It repeats states on every new connection, and sends records once."""
+    """A publisher of the messages on ``pipe``. States are retained: the transport sends them again where it must."""
 
     def __init__(self, pipe: int, transport: Transport, stops_of: Config | None = None) -> None:
         """Store the arguments; ``stops_of``: a robot without a bridge, which would repeat the stops."""
         self._pipe, self._transport, self._stops_of = pipe, transport, stops_of
-        self._states: dict[str, Message] = {}
         self._reactor = Reactor()
         self._wake = WakeupPipe()
         self._stopping = False
@@ -50,11 +49,10 @@ class Announcer:
     def run(self, notify: Notifier, hub: ZenohHub | None = None) -> None:
         """Run until :meth:`stop` or the end of the pipe; then publish what is left in the pipe, and the will."""
         self._reactor.watch(self._pipe, self._receive)
-        self._reactor.watch(self._wake.fileno(), self._publish_states)
+        self._reactor.watch(self._wake.fileno(), self._wake.clear)
         self._reactor.every(ALIVE_PERIOD_S, notify.alive)
         if hub is not None:
             self._reactor.every(ALIVE_PERIOD_S, hub.look)
-        self._transport.on_state(self._on_state)
         notify.ready()
         try:
             self._transport.open(timeout=0.0)
@@ -64,8 +62,8 @@ class Announcer:
                 repeat_stops(self._stops_of, self._transport, self._reactor)
             self._reactor.run_until(lambda: self._stopping)
             with suppress(BlockingIOError):
-                while (envelope := next_envelope(self._pipe)) is not None:
-                    self._handle(envelope)
+                while (message := next_message(self._pipe)) is not None:
+                    self._publish(message)
         finally:
             self._transport.close()
 
@@ -75,20 +73,10 @@ class Announcer:
         self._wake.set()
 
     def _receive(self) -> None:
-        envelope = next_envelope(self._pipe)
-        if envelope is None:
+        message = next_message(self._pipe)
+        if message is None:
             self._stopping = True
         else:
-            self._handle(envelope)
-
-    def _handle(self, envelope: Envelope) -> None:
-        if envelope.kind == "state":
-            self._states[envelope.message.topic] = envelope.message
-        self._publish(envelope.message)
-
-    def _publish_states(self) -> None:
-        self._wake.clear()
-        for message in self._states.values():
             self._publish(message)
 
     def _publish(self, message: Message) -> None:
@@ -96,10 +84,6 @@ class Announcer:
             self._transport.publish(message.topic, message.payload, qos=message.qos, retain=message.retain)
         except Exception:  # noqa: BLE001 - no message may end the hub
             self._log.exception(message.topic, "could not publish on %s", message.topic)
-
-    def _on_state(self, state: State) -> None:
-        if state is State.CONNECTED:
-            self._wake.set()
 
 
 def run(
@@ -109,10 +93,10 @@ def run(
 ) -> int:
     """Publish the messages on stdin through ``make_transport(will)``, beside the hub; return the exit code."""
     try:
-        will = next_envelope(_STDIN)
+        will = next_message(_STDIN)
         if will is None:  # the launcher has ended already
             return 0
-        announcer = Announcer(_STDIN, make_transport(will.message), stops_of)
+        announcer = Announcer(_STDIN, make_transport(will), stops_of)
     except PebbleError as error:
         log.error("the launcher publishes nothing: %s", error)
         return 1
@@ -136,7 +120,7 @@ def main(arguments: list[str]) -> int:
     """Run the announcer of the robot with this config; return the exit code."""
     set_up_logging("INFO")
     if len(arguments) != 1:
-        log.error("usage: python -m pebble.launcher.announcer CONFIG, with envelopes from the launcher on stdin")
+        log.error("usage: python -m pebble.launcher.announcer CONFIG, with messages from the launcher on stdin")
         return 2
     try:
         config = config_of_process(arguments[0])

@@ -3,7 +3,6 @@
 import logging
 import os
 import socket
-from typing import Literal
 
 import msgspec
 
@@ -13,17 +12,9 @@ from pebble.transports import Message
 
 log = logging.getLogger(__name__)
 
-ENVELOPE_LIMIT = 65_536  # bytes; longer ones are dropped
+_encode = msgspec.msgpack.Encoder().encode
+MESSAGE_LIMIT = 65_536  # bytes; longer ones are dropped
 _RETRY_S = 0.1  # until the next attempt, when the socket had no room for a state
-
-Kind = Literal["will", "state", "record"]
-
-
-class Envelope(msgspec.Struct, frozen=True, array_like=True):
-    """A message with its kind: the will, a state or a record. The will comes first."""
-
-    kind: Kind
-    message: Message
 
 
 class AnnouncerPipe:
@@ -46,21 +37,21 @@ class AnnouncerPipe:
         self.close()
         self._socket, announcers_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._socket.setblocking(False)
-        self._send(_encoded("will", will))
+        self._send(_encode(will))
         self._unsent = dict(self._states)
         self._send_states()
         return announcers_end.detach()
 
     def state(self, message: Message) -> None:
         """Send a state, which replaces the former one of its topic."""
-        raw = _encoded("state", message)
+        raw = _encode(message)
         if self._fits(raw, message.topic):
             self._states[message.topic] = self._unsent[message.topic] = raw
             self._send_states()
 
     def record(self, message: Message) -> None:
         """Send a message once, after the unsent states; without room it is dropped."""
-        raw = _encoded("record", message)
+        raw = _encode(message)
         if self._fits(raw, message.topic) and not (self._send_states() and self._send(raw)):
             self.dropped += 1
 
@@ -86,12 +77,12 @@ class AnnouncerPipe:
 
     def _fits(self, raw: bytes, topic: str) -> bool:
         """True if a message can be sent; else it is counted, and for each topic logged once."""
-        if len(raw) <= ENVELOPE_LIMIT:
+        if len(raw) <= MESSAGE_LIMIT:
             return True
         self.dropped += 1
         if topic not in self._too_long:
             self._too_long.add(topic)
-            log.error("%s is not published: it has %d bytes, and %d is the most", topic, len(raw), ENVELOPE_LIMIT)
+            log.error("%s is not published: it has %d bytes, and %d is the most", topic, len(raw), MESSAGE_LIMIT)
         return False
 
     def _send(self, raw: bytes) -> bool:  # False: no announcer, or no room now
@@ -107,11 +98,10 @@ class AnnouncerPipe:
         return True
 
 
-def _encoded(kind: Kind, message: Message) -> bytes:
-    return msgspec.msgpack.encode(Envelope(kind, message))
+def next_message(descriptor: int) -> Message | None:
+    """Return the next message from the launcher, first the will; None at the end.
 
-
-def next_envelope(descriptor: int) -> Envelope | None:
-    """Return the next envelope that the launcher has sent; None at the end. Raises BlockingIOError, DecodeError."""
-    raw = os.read(descriptor, ENVELOPE_LIMIT)
-    return msgspec.msgpack.decode(raw, type=Envelope) if raw else None
+    Raises BlockingIOError, DecodeError.
+    """
+    raw = os.read(descriptor, MESSAGE_LIMIT)
+    return msgspec.msgpack.decode(raw, type=Message) if raw else None

@@ -7,10 +7,10 @@ from collections.abc import Callable
 from math import inf
 from types import FrameType
 
+from pebble.runtime.signals import ending_signals
 from pebble.runtime.timers import Timer, Timers
 from pebble.transports.wakeup import WakeupPipe
 
-_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 _TURN_S = 1.0  # the longest wait of one turn
 _STALL_S = 2.0  # a turn that takes this much longer: the process was frozen, as a suspended machine's, or starved
 
@@ -100,7 +100,7 @@ class StopSignals:
     def install(self) -> None:
         """Handle the signals until the process ends, except ignored ones (nohup)."""
         signal.set_wakeup_fd(self.wakeup.set_fileno, warn_on_full_buffer=False)
-        for number in _SIGNALS:
+        for number in ending_signals():
             if signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, self._receive)
 

@@ -16,8 +16,7 @@ from pebble.errors import ConfigError, PayloadError
 from pebble.extension import part
 from pebble.forwarding.forwarder import Routed, barrier
 from pebble.forwarding.names import Names
-from pebble.forwarding.observer import ROBOT, Observer, Observers, Step, steps_of
-from pebble.forwarding.private_topics import PrivateTopics
+from pebble.forwarding.observer import ROBOT, Observer, Observers, PrivateTopics, Step, steps_of
 from pebble.forwarding.retained_window import INITIAL_SYNC_S
 from pebble.forwarding.routing import TABLE_A1, Drop, Side
 from pebble.forwarding.service import CHECK_SOON_S, ForwardingService

@@ -442,7 +442,7 @@ class TestMistakes:
         ("place", "value", "warning"),
         [
             ("services.mqtt_bridge.heartbeat", {"qos": 0, "retain": False},
-             ".{qos, retain}: no longer used, the contract fixes QoS and retain flag"),
+             ".qos, services.mqtt_bridge.heartbeat.retain: no longer used, the contract fixes QoS and retain flag"),
             ("services.mqtt_bridge", {"remote": UPLINK, "remote_mqtt": {"host": "broker.example"}},
              '.remote_mqtt: not used: remote.kind is "zenoh"'),
             ("services.serial_mcu_bridge", {"safety": {"stop_on_shutdown": False}, "instances": {"a": {}}},

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import json
 import math
-import random
-import re
-import string
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -33,10 +28,8 @@ from pebble.contract.payloads import (
     SoundboardStatus,
 )
 from pebble.errors import PayloadError
-from tests.support import cases
 
 REFUSED = "refused"
-TRIED = cases(4_000, 20_000)
 BOOLEANS = [channel for channel in CHANNELS if channel.payload is bool]
 JSON_COMMANDS = [channel for channel in CHANNELS if channel.direction == "incoming" and channel.payload is not bytes]
 
@@ -77,7 +70,13 @@ SOUNDS: dict[bytes, dict[str, Any]] = {
 MEANINGS: list[tuple[Channel, bytes, Any]] = [
     # white space may follow a value: a bridge's probe on a flag's topic is the flag's value
     (c.MQTT_VIDEO, b'{"value": true}' + b" \t\n" * 8, True),
-    # drive values, whose numbers an independent reader reads below
+    (c.MQTT_VIDEO, b"true", True),
+    (c.MQTT_VIDEO, b'{"value": 1, "enabled": false}', False),
+    *(
+        (c.OUTLET_COMMAND, raw, OutletCommand(on=True))
+        for raw in (b'{"on": true}', b'{"value": {"on": true}, "on": 1}')
+    ),
+    # drive values, whose numbers are read below
     (c.DRIVE, b'{"x": 1, "t": 1710969600123, "origin": {"a": [1]}}', Drive(x=1, t=1710969600123)),
     # their source, their run, and how long they are valid
     (c.DRIVE, b'{"z": 1, "source": "autonomy", "run": 17}', Drive(z=1, source="autonomy", run=17)),
@@ -124,6 +123,7 @@ REFUSALS: dict[Channel, list[bytes]] = {
     c.REBOOT: [b"1", b'"true"', b"{}", b'{"value": 1}', b'{"enabled": "on"}', b'{"value": {"value": true}}', b"",
                b"null", b"[true]", b'{"on": true}', b"TRUE", b"true false"],
     c.DRIVE: [b"", b"null", b"[]", b"1", b"true", b'"x"', b'{"x": 1', b'{"x": 1}}'],
+    c.OUTLET_COMMAND: [b"true", b"{}", b'{"on": 1}', b'{"value": {"on": null}}'],
     c.LIGHTS_FLASH: [b'{"period": 1e999}', b'{"b": 1, "period": "inf"}', b"[1, 1, 1]", b'"1"'],
     c.SOUNDBOARD_COMMAND: [
         *(b'{"action": "play", "file": "a", "repeat": ' + number + b"}" for number in (b"-1", b'"yes"', b"0.5", b"[]")),
@@ -348,121 +348,3 @@ def test_nothing_that_is_no_number_can_be_published(number: float) -> None:
     for make in (lambda: Drive(x=number), lambda: ChargingLevel(value=number), lambda: LightsFlash(period=number)):
         with pytest.raises(ValueError, match="finite"):
             make()
-
-
-# -- against an independent reading of the contract
-
-
-def _strict_float(text: str) -> float:
-    number = float(text)
-    if not math.isfinite(number):
-        raise ValueError(text)
-    return number
-
-
-def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    json.dumps(pairs, ensure_ascii=False).encode()  # lone surrogates, also under keys that a later one replaces
-    return dict(pairs)
-
-
-def oracle_json(raw: bytes) -> Any:
-    """The standard library's reading, made strict; ValueError or RecursionError for what is no JSON."""
-    text = re.sub(rb"^[^!-~\xf5-\xff]+|[^!-~\xf5-\xff]*(\0(?s:.*))?$", b"", raw).decode()
-    plain = json.loads(text, parse_float=_strict_float, parse_constant=_strict_float, object_pairs_hook=_object)
-    json.dumps(plain, ensure_ascii=False).encode()
-    if len(raw) > 65536:
-        raise ValueError("too large")
-    return plain
-
-
-def oracle_boolean(plain: Any) -> Any:
-    candidates = [plain, plain.get("value"), plain.get("enabled")] if isinstance(plain, dict) else [plain]
-    return next((candidate for candidate in candidates if isinstance(candidate, bool)), REFUSED)
-
-
-def _axis(value: Any) -> float:
-    if type(value) not in (int, float, str) or (isinstance(value, str) and "_" in value) or not str(value).isascii():
-        return 0.0
-    with contextlib.suppress(ValueError):
-        value = float(value)
-    return 0.0 if isinstance(value, str) else max(-1.0, min(1.0, _strict_float(str(value))))
-
-
-def oracle_drive(plain: Any) -> Any:
-    command = plain["value"] if isinstance(plain.get("value"), dict) else plain
-    return tuple(_axis(command.get(axis, 0)) for axis in "xzy")
-
-
-def oracle_outlet(plain: Any) -> Any:
-    command = plain["value"] if isinstance(plain.get("value"), dict) else plain
-    return command["on"] if isinstance(command["on"], bool) else REFUSED
-
-
-def judged(oracle: Callable[[Any], Any], raw: bytes) -> Any:
-    try:
-        return oracle(oracle_json(raw))
-    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
-        return REFUSED
-
-
-def decoded(channel: Channel, raw: bytes) -> Any:
-    value = decoded_exactly(channel, raw)
-    if isinstance(value, Drive):
-        return (value.x, value.z, value.y)
-    return value.on if isinstance(value, OutletCommand) else value
-
-
-KEYS = ["x", "z", "y", "value", "enabled", "on", "t", "", "X", "k\u00e9"]
-ATOMS = [
-    "0", "-0", "1", "-1.5", "0.25", "1e3", "1e-400", "1e400", "-1E+2", "01", "1.", ".5", "+1", "NaN", "Infinity",
-    "-Infinity", "true", "false", "null", "True", '"0.5"', '" 1 "', '"nan"', '"inf"', '"1e400"', '"1_0"', '"a"', '""',
-    '"\\u0031"', '"\\ud83d\\ude00"', '"\\ud800"', '"\\udc00x"', '"\\x"', '"\u0663"', '"\t"', "9" * 30,
-    "9" * 400, "9" * 5000,
-    "[]", "{}",
-]  # fmt: skip
-
-
-def _text(rng: random.Random, depth: int) -> str:
-    if depth == 0 or rng.random() < 0.35:
-        return rng.choice(ATOMS)
-    if rng.random() < 0.2:
-        return "[" + ",".join(_text(rng, depth - 1) for _ in range(rng.randrange(3))) + "]"
-    pairs = (f'"{rng.choice(KEYS)}": {_text(rng, depth - 1)}' for _ in range(rng.randrange(4)))
-    return "{" + ", ".join(pairs) + "}"
-
-
-def _good(rng: random.Random) -> str:
-    """Something valid more often than not, so that both answers are tried."""
-    number = rng.choice(["0", "1", "-0.5", '"0.5"', "3"])
-    inner = rng.choice([f'{{"x": {number}, "z": {number}}}', f'{{"y": {number}}}', '{"on": true}', "true", "false"])
-    return rng.choice(["{}", '{{"value": {}}}', '{{"enabled": {}}}', " {}\n", '{{"on": {}}}']).format(inner)
-
-
-def payloads(seed: int, count: int) -> list[bytes]:
-    rng = random.Random(seed)
-    made = []
-    for _ in range(count):
-        text = _good(rng) if rng.random() < 0.3 else _text(rng, 4)
-        raw = bytearray(text.encode())
-        if raw and rng.random() < 0.25:
-            where = rng.randrange(len(raw))
-            raw[where : where + rng.randrange(3)] = rng.choice(
-                [b"\xff", b"\x00", b'"', b"\\", b"[", b",", b"\xe2\x82", b""]
-            )
-        if rng.random() < 0.02:
-            raw = bytearray(rng.choices(string.printable.encode() + b"\x80\xfe", k=rng.randrange(40)))
-        made.append(bytes(raw))
-    return made
-
-
-@pytest.mark.parametrize(
-    ("channel", "oracle"),
-    [(c.MQTT_AUDIO, oracle_boolean), (c.DRIVE, oracle_drive), (c.OUTLET_COMMAND, oracle_outlet)],
-    ids=["boolean", "drive", "outlet"],
-)
-def test_payloads_mean_the_same_to_an_independent_reader(channel: Channel, oracle: Callable[[Any], Any]) -> None:
-    tried = payloads(20_261, TRIED)
-    results = [(raw, decoded(channel, raw), judged(oracle, raw)) for raw in tried]
-    assert [result for result in results if result[1] != result[2]] == []
-    accepted = sum(result[1] is not REFUSED for result in results)
-    assert 0.025 < accepted / TRIED < 0.975  # both answers were really tried

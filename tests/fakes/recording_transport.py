@@ -17,16 +17,10 @@ class RecordingTransport(Transport):
         super().__init__(client_id, will=will)
         self._file, self._hangs = file, hangs
 
-    def lose(self) -> None:
-        self._set_state(State.CONNECTING)
-
-    def find(self) -> None:
-        self._set_state(State.CONNECTED)
-
     def _open(self, timeout: float) -> None:
         if self._hangs:
             threading.Event().wait()
-        self.find()
+        self._set_state(State.CONNECTED)
 
     def _close(self, will: Message | None) -> None:
         if will is not None:

@@ -100,10 +100,19 @@ class TestFlags:
             ("bridge", "start R:1 stop start", "1", "1", ""),
             ("mirror", "start R:1 stop start", "1", "1", "1"),
             *((each, "start L:1 R:", "", "", "1") for each in ("bridge", "mirror")),
+            # a microphone that was switched off after the save of a broker or hub stays off
+            ("bridge", "start save R:1 Lonce:0 local-restored-late", "0", "1 0", "0"),
+            ("bridge", "start Lonce:1 save R:0 stop local-restored start", "0", "0 1 0", "1"),
+            ("bridge", "start R:1 save R:0 local-restored", "0", "1 0 1 0", ""),
+            ("mirror", "start R:1 save R:0 remote-restored", "0", "1 0", "1 0"),
         ],
     )
-    def test_histories(self, make: Make, service: str, history: str, value: str, local: str, remote: str) -> None:
+    @pytest.mark.parametrize("as_published", [False, True])
+    def test_histories(
+        self, make: Make, service: str, history: str, value: str, local: str, remote: str, as_published: bool
+    ) -> None:
         world = make(service)
+        world.as_published = as_published
         do(world, history)
         expected = value.encode() or None
         assert world.retained(FLAG) == (expected, expected)

@@ -14,7 +14,7 @@ import pytest
 
 from pebble.config import Config, parse
 from pebble.forwarding.service import ForwardingService
-from pebble.forwarding.side import Gate
+from pebble.forwarding.side import RESTORED_S, Gate
 from pebble.services.mqtt_bridge import service as bridge_module
 from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.services.mqtt_mirror import service as mirror_module
@@ -58,6 +58,8 @@ class Connection(MemoryTransport):
         self.reply = Answer(1 if self.reply is None else self.reply.number + 1, seconds, None)
 
     def receive(self, delivery: Any) -> None:
+        if self.as_published and delivery.message.retain_requested:
+            delivery = replace(delivery, message=msgspec.structs.replace(delivery.message, retain=True))
         if self.late_s:
             since = clock.since_boot() - self.late_s
             delivery = replace(delivery, message=msgspec.structs.replace(delivery.message, waiting_since=since))
@@ -143,6 +145,8 @@ class World:
         self.connections: list[Connection] = []
         self.local_hub = Hub()
         self.remote_hub = self.local_hub if one else Hub()
+        self.as_published = False  # connections of services show retain flags as they were published
+        self.saved: dict[Hub, dict[str, Message]] = {}
         self.local = Client(Connection("someone-local", self.local_hub, self))
         self.remote = Client(Connection("operator", self.remote_hub, self))
         self.running: list[Running] = []
@@ -166,6 +170,7 @@ class World:
         """Start a service; its sides may be away. ``broker``: on its remote side, if that is another one."""
         self._broker = broker or self.remote_hub
         here = Connection("here", self.local_hub, self)
+        here.as_published = self.as_published
         made = SERVICES[service or self.name](self._config(section), here, clock=lambda: self.now)
         first = self.connections.index(here) + 1
         self.running.append(Running(made, here, *[*self.connections[first:], None][:2]))
@@ -205,7 +210,19 @@ class World:
             "back": lambda: self.here.mend(),
             "local-forgets": lambda: (self.local_hub.stop(forget=True), self.run(1), self.local_hub.start()),
             "remote-forgets": lambda: (self.remote_hub.stop(forget=True), self.run(1), self.remote_hub.start()),
+            "save": lambda: self.saved.update({hub: dict(hub.retained) for hub in (self.local_hub, self.remote_hub)}),
+            "local-restored": lambda: self._restore(self.local_hub),
+            "local-restored-late": lambda: self._restore(self.local_hub, after_s=RESTORED_S + 1),
+            "remote-restored": lambda: self._restore(self.remote_hub),
         }
+
+    def _restore(self, hub: Hub, after_s: float = 1.0) -> None:
+        """It ends, and starts again with what it had at the last save; nobody knows who had published that."""
+        hub.stop(forget=True)
+        self.run(after_s)
+        hub.retained.update(self.saved[hub])
+        hub.publishers.update(dict.fromkeys(hub.retained, Connection("somebody", hub, self)))
+        hub.start()
 
     def retained(self, suffix: str) -> tuple[bytes | None, bytes | None]:
         """What both sides retain: local, remote."""
@@ -238,4 +255,6 @@ class World:
         return None if config.security.level == "open" else Connection("stops", self._broker, self)
 
     def _uplink(self, *_arguments: Any, will: Message | None = None) -> Connection:
-        return Connection("uplink", self._broker, self, will=will)
+        uplink = Connection("uplink", self._broker, self, will=will)
+        uplink.as_published = self.as_published
+        return uplink

@@ -10,7 +10,6 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -19,103 +18,37 @@ from pebble.contract import ESTOP, ESTOP_STATE, codec
 from pebble.contract.payloads import EstopCommand, LogRecord
 from pebble.launcher import log_forwarding
 from pebble.launcher.announcer import Announcer
-from pebble.launcher.announcer_pipe import ENVELOPE_LIMIT, AnnouncerPipe, next_envelope
+from pebble.launcher.announcer_pipe import MESSAGE_LIMIT, AnnouncerPipe, next_message
 from pebble.launcher.log_forwarding import LevelReader, LogForwarder, NonBlockingWriter, OwnRecords, text_of
 from pebble.launcher.reactor import Reactor
 from pebble.launcher.repeated_stops import REPEAT_S, repeat_stops
 from pebble.runtime.parent import Notifier
-from pebble.transports import Message, QoS, State
+from pebble.transports import Message, QoS
 from pebble.transports.memory import MemoryHub, MemoryTransport
-from tests.fakes.recording_transport import RecordingTransport
-from tests.launcher.conftest import lines_of
 from tests.support import WAIT_S, until
 
-
-class ConnectedAnnouncer:
-    """An announcer on a thread of the test, its pipe, and what it has sent."""
-
-    def __init__(self, folder: Path) -> None:
-        self._file = folder / "record"
-        self.transport = RecordingTransport("announcer", self._file)
-        self.pipe = AnnouncerPipe(Reactor())
-        self._descriptor = self.pipe.connect(Message("will", b"{}"))
-        os.read(self._descriptor, 1000)  # the will; the transport has it already
-        self.announcer = Announcer(self._descriptor, self.transport)
-        self._thread = threading.Thread(target=self.announcer.run, args=(Notifier(),))
-        self._thread.start()
-        assert until(lambda: self.transport.state is State.CONNECTED)
-
-    def state(self, number: int) -> None:
-        self.pipe.state(message("status", number))
-
-    def record(self, number: int) -> None:
-        self.pipe.record(message("logs", number))
-
-    def sent(self, topic: str) -> list[Any]:
-        parsed = [json.loads(line) for line in lines_of(self._file)]
-        return [line["payload"]["t"] for line in parsed if line["topic"] == topic]
-
-    def join(self) -> None:
-        self._thread.join(WAIT_S)
-        assert not self._thread.is_alive()
-
-    def close(self) -> None:
-        self.pipe.close()
-        self.join()
-        os.close(self._descriptor)
-
-
-@pytest.fixture
-def connected(tmp_path: Path) -> Iterator[ConnectedAnnouncer]:
-    connected = ConnectedAnnouncer(tmp_path)
-    yield connected
-    connected.close()
-
-
-def message(topic: str, number: int) -> Message:
-    return Message(topic, json.dumps({"t": number}).encode())
-
-
-def test_states_are_published_again_on_the_next_connection(connected: ConnectedAnnouncer) -> None:
-    connected.state(1)
-    assert until(lambda: connected.sent("status")[-1:] == [1])
-    connected.transport.lose()
-    connected.state(2)
-    before = len(connected.sent("status"))
-    assert until(lambda: connected.transport.counters["refused"] == 1)
-    connected.transport.find()
-    assert until(lambda: len(connected.sent("status")) > before)
-    assert connected.sent("status")[-1] == 2
-    connected.state(7)
-    connected.pipe.close()
-    connected.join()
-    assert connected.sent("status")[-1] == 7, "it ends with the launcher"
-
-
-def test_records_are_published_only_once(connected: ConnectedAnnouncer) -> None:
-    connected.record(1)
-    assert until(lambda: connected.sent("logs") == [1])
-    connected.transport.lose()
-    connected.record(2)
-    assert until(lambda: connected.transport.counters["refused"] == 1)
-    connected.transport.find()
-    connected.record(3)
-    assert until(lambda: connected.sent("logs") == [1, 3])
-
-
-def test_a_failure_to_publish_does_not_end_it(
-    connected: ConnectedAnnouncer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    with monkeypatch.context() as broken:
-        broken.setattr(connected.transport, "publish", lambda *_, **__: 1 // 0)
-        connected.record(1)
-        connected.state(2)
-        assert until(lambda: [record.args for record in caplog.records] == [("logs", 1), ("status", 1)])
-    connected.record(3)
-    assert until(lambda: connected.sent("logs") == [3])
-
-
 WILL = Message("status", b"gone", QoS.DELIVERED, retain=True)
+
+
+def test_a_failure_to_publish_does_not_end_it_and_what_is_left_in_the_pipe_is_published(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    pipe, sent = AnnouncerPipe(Reactor()), list[bytes]()
+    descriptor, transport = pipe.connect(WILL), MemoryTransport("announcer", MemoryHub())
+    assert next_message(descriptor) == WILL
+    with monkeypatch.context() as broken:
+        broken.setattr(transport, "publish", lambda *_, **__: 1 // 0)
+        thread = threading.Thread(target=Announcer(descriptor, transport).run, args=(Notifier(),))
+        thread.start()
+        pipe.record(Message("logs", b"1"))
+        pipe.state(Message("status", b"2"))
+        assert until(lambda: [record.args for record in caplog.records] == [("logs", 1), ("status", 1)])
+        broken.setattr(transport, "publish", lambda _topic, payload, **_options: sent.append(payload))
+        pipe.record(Message("logs", b"3"))
+        pipe.close()
+        thread.join(WAIT_S)
+    assert sent == [b"3"]
+    os.close(descriptor)
 
 
 class Connection:
@@ -136,14 +69,14 @@ class Connection:
             os.close(self._announcer)
             self._announcer = None
 
-    def received(self) -> list[tuple[str, bytes]]:
-        """Kind and payload of every envelope in the pipe."""
+    def received(self) -> list[bytes]:
+        """The payload of every message in the pipe."""
         assert self._announcer is not None
-        envelopes = []
+        payloads = []
         with suppress(BlockingIOError):
-            while (envelope := next_envelope(self._announcer)) is not None:
-                envelopes.append((envelope.kind, envelope.message.payload))
-        return envelopes
+            while (message := next_message(self._announcer)) is not None:
+                payloads.append(message.payload)
+        return payloads
 
     def fill(self) -> int:
         """Records until one is dropped; returns how many there was room for."""
@@ -172,8 +105,8 @@ def test_a_new_announcer_receives_the_will_and_the_present_states_first(connecti
     connection.pipe.state(Message("b", b"1"))
     connection.connect()
     connection.pipe.record(Message("logs", b"2"))
-    expected = [("will", b"gone"), ("state", b"new"), ("state", b"1")]
-    assert connection.received() == [*expected, ("record", b"2")]
+    expected = [b"gone", b"new", b"1"]
+    assert connection.received() == [*expected, b"2"]
     connection.connect()
     assert connection.received() == expected
 
@@ -184,7 +117,7 @@ def test_records_that_cannot_be_sent_are_counted(connection: Connection) -> None
     connection.connect()
     connection.hang_up()
     connection.pipe.record(Message("logs", b"the announcer has died"))
-    connection.pipe.record(Message("logs", b"x" * ENVELOPE_LIMIT))
+    connection.pipe.record(Message("logs", b"x" * MESSAGE_LIMIT))
     assert connection.pipe.dropped == 3
 
 
@@ -193,12 +126,12 @@ def test_a_state_that_is_too_long_is_logged_once_and_holds_up_no_other(
 ) -> None:
     connection.connect()
     for _ in range(2):
-        connection.pipe.state(Message("a", b"x" * ENVELOPE_LIMIT))
+        connection.pipe.state(Message("a", b"x" * MESSAGE_LIMIT))
     connection.pipe.state(Message("b", b"1"))
     connection.pipe.record(Message("logs", b"2"))
-    assert connection.received() == [("will", b"gone"), ("state", b"1"), ("record", b"2")]
+    assert connection.received() == [b"gone", b"1", b"2"]
     assert connection.pipe.dropped == 2
-    assert caplog.messages == ["a is not published: it has 65611 bytes, and 65536 is the most"]
+    assert caplog.messages == ["a is not published: it has 65604 bytes, and 65536 is the most"]
 
 
 def test_without_a_bridge_a_stop_is_repeated_until_its_owner_names_it(tmp_path: Path) -> None:
@@ -229,9 +162,9 @@ def test_states_are_not_lost_to_a_flood_of_records(connection: Connection) -> No
     connection.pipe.state(Message("a", b"old"))
     connection.pipe.state(Message("a", b"new"))
     connection.received()
-    received: list[tuple[str, bytes]] = []
+    received: list[bytes] = []
     assert connection.reactor.run_until(lambda: bool(received.extend(connection.received()) or received), 5)
-    assert received == [("state", b"new")]
+    assert received == [b"new"]
 
 
 class Forwarded:

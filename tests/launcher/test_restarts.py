@@ -7,7 +7,6 @@ import os
 import re
 import shutil
 import signal
-import socket
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -29,7 +28,7 @@ from pebble.launcher.sd_notify import SystemdNotifier
 from pebble.runtime import notes
 from pebble.runtime.notes import Held, Wanted
 from tests.launcher.conftest import CONNECTION, DEVICE, Launch, Robot, Row
-from tests.support import WAIT_S, gone, refused, until
+from tests.support import gone, refused, until
 
 
 def crash(policy: RestartPolicy, at: float, ran_for: float = 0.0) -> float:
@@ -172,15 +171,6 @@ def test_a_launcher_that_gets_little_time_still_ends_what_hangs() -> None:
 def test_the_watchdog_is_served_at_half_its_time(environment: dict[str, str], period_s: float | None) -> None:
     own = {name: text.replace("own", str(os.getpid())) for name, text in environment.items()}
     assert SystemdNotifier(own).watchdog_period_s == period_s
-
-
-def test_systemd_is_told_also_at_an_abstract_address() -> None:
-    name = f"pebble-{os.getpid()}"
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
-        systemd.bind(f"\0{name}")
-        systemd.settimeout(WAIT_S)
-        SystemdNotifier({"NOTIFY_SOCKET": f"@{name}"}).ready()
-        assert systemd.recv(64) == b"READY=1"
 
 
 @pytest.mark.parametrize("mode", [None, 0o755])

@@ -6,10 +6,12 @@ runs as long as a module's tests of one kind; `close_clients` ends what one test
 
 from __future__ import annotations
 
-import json
 import sys
 import tomllib
 from abc import ABC, abstractmethod
+from collections.abc import Callable
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -33,7 +35,7 @@ class Net(ABC):
 
     @abstractmethod
     def settings(self, **changes: Any) -> Any:
-        """Settings of a client, changed by keyword (the settings class's field names)."""
+        """Settings of a client, changed by keyword (the settings class's field names); they must pickle."""
 
     @abstractmethod
     def start_network(self) -> None:
@@ -59,10 +61,6 @@ class Net(ABC):
     def heal(self) -> None:
         """After a test that failed half-way: make the network run again. Does nothing if it runs."""
 
-    def portable_settings(self) -> Any:
-        """Settings a program of its own can use; they must pickle."""
-        return self.settings()
-
     # -- what tests call
 
     def client(self, name: str, *, will: Message | None = None, opened: bool = True, **changes: Any) -> Transport:
@@ -76,7 +74,7 @@ class Net(ABC):
 
     def peer(self, name: str, *, will: Message | None = None) -> Any:
         """A connected client that can be killed: in its own process where the network is real."""
-        peer = ProcessPeer(self.kind, name, self.portable_settings(), will)
+        peer = ProcessPeer(self.kind, name, self.settings(), will)
         self._peers.append(peer)
         return peer
 
@@ -100,72 +98,52 @@ class Net(ABC):
 
 
 class ProcessPeer:
-    """A client in a process of its own (:func:`main`), asked in lines of JSON."""
+    """A client in a process of its own (:func:`main`), which does one thing after the other."""
 
     def __init__(self, kind: str, name: str, settings: Any, will: Message | None) -> None:
-        self._process = Forked("tests.transports.net", kind, name, settings, will)
-        assert self._answer() is True, "the peer did not connect"
+        self._pipe, theirs = Pipe()
+        self._process = Forked("tests.transports.net", kind, name, settings, will, theirs)
+        theirs.close()
+        assert self._pipe.recv() is True, "the peer did not connect"
         self.pid = self._process.pid
 
     def publish(self, topic: str, payload: bytes, *, qos: QoS = QoS.DELIVERED, retain: bool = False) -> bool:
-        return bool(self._ask({"topic": topic, "payload": payload.hex(), "qos": int(qos), "retain": retain}))
+        return bool(self._ask("publish", topic, payload, qos=qos, retain=retain))
 
     def listen(self) -> None:
         """Subscribe to everything."""
-        self._ask({"listen": True})
+        self._ask("listen")
 
     def heard(self) -> Any:
         """Return how many messages it has received, and the text of the last one."""
-        return self._ask({"heard": True})
+        return self._ask("heard")
 
     def kill(self) -> None:
         self._process.kill()
         self._process.wait(WAIT_S)
-        self._release()
 
     def close(self) -> None:
-        self._ask({"close": True})
+        self._ask("close")
         self._process.wait(WAIT_S)
-        self._release()
 
-    def _ask(self, request: dict[str, Any]) -> Any:
-        self._process.stdin.write(json.dumps(request) + "\n")
-        self._process.stdin.flush()
-        return self._answer()
-
-    def _answer(self) -> Any:
-        line = self._process.stdout.readline()
-        assert line, f"the peer died with exit code {self._process.wait(WAIT_S)}"
-        return json.loads(line)
-
-    def _release(self) -> None:
-        for pipe in (self._process.stdin, self._process.stdout):
-            pipe.close()
+    def _ask(self, what: str, *arguments: Any, **options: Any) -> Any:
+        self._pipe.send((what, arguments, options))
+        return self._pipe.recv()
 
 
-def main(kind: str, name: str, settings: Any, will: Message | None) -> None:
-    """Follow the commands in lines of JSON on stdin."""
+def main(kind: str, name: str, settings: Any, will: Message | None, pipe: Connection) -> None:
+    """Do what comes through ``pipe``, and answer."""
     client, received = create(kind, name, settings, will=will).open(10), list[Message]()
-    _report(client.state is State.CONNECTED)
-    for line in sys.stdin:
-        request = json.loads(line)
-        if "close" in request:
-            client.close()
-            _report(True)
-            return
-        if "listen" in request:
-            client.subscribe("#", received.append)
-            _report(True)
-        elif "heard" in request:
-            _report([len(received), received[-1].payload.decode() if received else ""])
-        else:
-            payload = bytes.fromhex(request["payload"])
-            _report(client.publish(request["topic"], payload, qos=QoS(request["qos"]), retain=request["retain"]))
-
-
-def _report(answer: object) -> None:
-    sys.stdout.write(json.dumps(answer) + "\n")
-    sys.stdout.flush()
+    does: dict[str, Callable[..., Any]] = {
+        "publish": client.publish,
+        "listen": lambda: client.subscribe("#", received.append) and None,
+        "heard": lambda: [len(received), received[-1].payload.decode() if received else ""],
+        "close": client.close,
+    }
+    pipe.send(client.state is State.CONNECTED)
+    while client.state is not State.CLOSED:
+        what, arguments, options = pipe.recv()
+        pipe.send(does[what](*arguments, **options))
 
 
 class Received:
@@ -195,9 +173,6 @@ class MemoryNet(Net):
 
     def settings(self, **_changes: Any) -> Any:
         return self._hub
-
-    def portable_settings(self) -> Any:
-        return MemoryHub()
 
     def start_network(self) -> None:
         self._hub.start()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 import ssl
 import threading
-import tracemalloc
 from collections.abc import Callable
 from contextlib import suppress
 from importlib.metadata import EntryPoint, EntryPoints
@@ -16,47 +15,31 @@ import pytest
 from pebble.errors import TransportError
 from pebble.transports import GROUP, Message, QoS, State, base, create, own_retained
 from pebble.transports.ages import MessageAges
-from pebble.transports.base import Subscriptions
 from pebble.transports.bounds import BoundedQueue, BoundedTable
+from pebble.transports.counters import Counters
+from pebble.transports.credentials import make_context
 from pebble.transports.memory import MemoryHub, MemoryTransport
+from pebble.transports.own_retained import OwnRetained
 from pebble.transports.renewed import Renewed
 from pebble.transports.settings import TlsSettings
-from pebble.transports.tls import make_context
-from pebble.transports.topics import check_topic
-from pebble.transports.zenoh.keymap import key_to_topic, topic_to_key
 from tests.support import ROOT, WAIT_S, until
 
 
-def test_retained_topics_are_bounded_in_number() -> None:
-    """A bridge retains all flags it forwards; those it knew first are sent again after an outage."""
-    hub = MemoryHub()
-    with MemoryTransport("bridge", hub) as bridge, MemoryTransport("late", hub) as late:
-        received: set[str] = set()
-        for number in range(own_retained.LIMIT + 50):
-            assert bridge.publish(f"flag{number}", b"1", qos=QoS.DELIVERED, retain=True)
-        assert bridge.counters["forgotten"] == 50
-        hub.stop(forget=True)
-        late.subscribe("#", lambda message: received.add(message.topic), limit=2 * own_retained.LIMIT)
-        hub.start()
-        assert until(lambda: len(received) == own_retained.LIMIT)
-        assert "flag0" in received
-
-
-def test_retained_messages_are_bounded_in_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_retained_messages_are_bounded_and_those_that_were_known_first_are_sent_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """An older value is not sent again in place of a newer one that is too large to be stored."""
+    monkeypatch.setattr(own_retained, "LIMIT", 3)
     monkeypatch.setattr(own_retained, "BYTES", 1000)
-    hub = MemoryHub()
-    with MemoryTransport("bridge", hub) as bridge, MemoryTransport("late", hub) as late:
-        for topic, size in (("a", 400), ("b", 400), ("c", 400), ("a", 900), ("d", 500)):
-            assert bridge.publish(topic, bytes(size), qos=QoS.DELIVERED, retain=True)
-        assert bridge.counters["forgotten"] == 2
-        hub.stop(forget=True)
-        assert not bridge.publish("e", bytes(400), qos=QoS.DELIVERED, retain=True)
-        assert (bridge.counters["forgotten"], bridge.counters["refused"]) == (3, 1)
-        received: dict[str, int] = {}
-        late.subscribe("#", lambda message: received.update({message.topic: len(message.payload)}))
-        hub.start()
-        assert until(lambda: received == {"b": 400, "d": 500})
+    counters, again = Counters(), list[tuple[str, int]]()
+    own = OwnRetained(counters)
+    history = [("a", 400), ("b", 400), ("c", 400), ("a", 900), ("d", 500), ("e", 400)]
+    stored = [own.remember(Message(topic, bytes(size), retain=True), sent=True) for topic, size in history]
+    assert stored == [True, True, False, False, True, False]
+    assert [own.remember(Message(topic, b"", retain=True), sent=False) for topic in "xy"] == [True, False]
+    assert counters["forgotten"] == 4
+    own.send_again({"b"}, lambda message: bool(again.append((message.topic, len(message.payload)))) or True)
+    assert again == [("x", 0), ("d", 500)]
 
 
 def test_a_slow_handlers_queue_is_bounded_in_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -79,19 +62,6 @@ def test_a_slow_handlers_queue_is_bounded_in_bytes(monkeypatch: pytest.MonkeyPat
         assert slow.dropped == client.counters["dropped"] == 6
 
 
-def test_long_topics_of_strangers_are_not_remembered() -> None:
-    with MemoryTransport("client", MemoryHub()) as client:
-        subscriptions, wanted = Subscriptions(), client.subscribe("a/#", lambda _: None)
-        subscriptions.add(wanted)
-        tracemalloc.start()
-        for number in range(1000):
-            assert subscriptions.matching(f"a/{number:60000}") == (wanted,)
-            assert key_to_topic(topic_to_key(check_topic(f"a/{number:1000}"))) == f"a/{number:1000}"
-        left, _ = tracemalloc.get_traced_memory()
-        tracemalloc.stop()
-    assert left < 500_000
-
-
 class TestQueue:
     def test_drops_as_many_as_a_large_one_needs(self) -> None:
         queue: BoundedQueue[str] = BoundedQueue(10, 100)
@@ -110,7 +80,7 @@ class TestQueue:
 class TestTable:
     def test_forgets_the_oldest_beyond_its_number(self) -> None:
         table: BoundedTable[bytes] = BoundedTable(2, 100, len)
-        for topic in ("a", "b", "a", "c"):
+        for topic in "abac":
             table[topic] = b"1"
         assert dict(table) == {"a": b"1", "c": b"1"}
 

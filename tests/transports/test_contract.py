@@ -475,6 +475,7 @@ def test_T12_reconnects_resubscribes_and_notifies_watchers(net: Net, base: str) 
     for turn in range(2):
         with reconnecting(client, sender):
             net.restart_network()
+        assert client.was_ended
         assert sender.publish(base, b"%d" % turn, qos=DELIVERED)
         assert until(lambda: len(received.payloads) == turn + 1)  # noqa: B023
     assert states == [State.CONNECTING, State.CONNECTED] * 2
@@ -781,8 +782,7 @@ if raises:
 
 @pytest.mark.parametrize("raises", [False, True])
 def test_T17_a_process_that_forgets_to_close_still_exits(net: Net, base: str, raises: bool) -> None:
-    settings = net.portable_settings()
-    recipe = base64.b64encode(pickle.dumps((net.kind, settings, base, raises))).decode()
+    recipe = base64.b64encode(pickle.dumps((net.kind, net.settings(), base, raises))).decode()
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     ended = subprocess.run([sys.executable, "-c", FORGETFUL, recipe], cwd=ROOT, env=env, timeout=30, check=False)
     assert ended.returncode == (3 if raises else 0)

@@ -21,12 +21,12 @@ import pytest
 
 from pebble.errors import TransportError
 from pebble.transports import Message, MqttSettings, QoS, State, TlsSettings, Transport, create
+from pebble.transports.credentials import make_context
 from pebble.transports.hosts import Address
 from pebble.transports.mqtt import refused_topics
 from pebble.transports.mqtt.client import Client, Opening
 from pebble.transports.mqtt.connection import UNACKED_LIMIT, UNACKED_RESERVE
 from pebble.transports.mqtt.ending import unreached
-from pebble.transports.tls import make_context
 from tests.support import ROOT, WAIT_S, Broker, RefusingBroker, beside, free_port, quickly, until
 from tests.tcp_proxy import BridgelessProxy, ForbiddingProxy, Hole, SlowTcpProxy, TcpProxy
 from tests.transports.net import Received

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import socket
-from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from threading import Event
@@ -185,151 +184,66 @@ def test_whether_the_broker_has_ended(events: str, ended: bool, monkeypatch: pyt
     assert verdict is ended
 
 
-STEP_S = 0.02
-ROUND_TRIP_S = 0.04
-VITAL = ("r/online", "r/capabilities", "r/estop/+")
-#: Seconds between two messages of each topic, the bytes of one, and whether it is retained.
-ROBOT = {
-    "r/online": (0.25, 20, True),
-    "r/estop/wheels": (30.0, 60, True),
-    "r/capabilities": (1e9, 3000, True),
-    "r/status": (5.0, 400, True),
-    "r/charging": (5.0, 20, True),
-    "r/touch": (0.02, 50, False),
-    "r/imu": (0.2, 300, False),
-    "r/rare": (20.0, 50, False),
-}
-Refuses = Callable[[str, int, float], bool]
+# -- topics on which a broker hangs up
+
+VITAL = ("r/online", "r/estop/+")
 
 
-class Link:
-    """One robot's connections to one broker, in virtual time. The link is lost ``losses`` times, each ``every_s``."""
-
-    def __init__(self, refuses: Refuses, *, every_s: float = 1e9, losses: int = 0, **sizes: int) -> None:
-        self.refuses, self.every_s, self.left = refuses, every_s, losses
-        self.sizes = {topic: sizes.get(topic.rpartition("/")[2], size) for topic, (_, size, _) in ROBOT.items()}
-        self.topics = RefusedTopics("robot", VITAL)
-        self.now, self.losses, self.arrived = 0.0, 0, Counter[str]()
-        self.connect()
-
-    def connect(self) -> None:
-        self.in_flight, self.began, self.lost_at = InFlightTable(), self.now, 1e9
-        self.pongs: list[float] = []
-        self.ping_at, self.hang_up_at = self.now + 0.5, 1e9
-        for topic, (_, _, retained) in ROBOT.items():
-            if retained:
-                self.publish(self.message(topic))
-
-    def message(self, topic: str) -> Message:
-        return Message(topic, bytes(self.sizes[topic]))
-
-    def publish(self, message: Message) -> None:
-        if not self.topics.admits(message, self.now):
-            return
-        self.in_flight.sent(message, 0, self.now)
-        if self.refuses(message.topic, len(message.payload), self.now):
-            self.hang_up_at = min(self.hang_up_at, self.now + ROUND_TRIP_S)
-        elif self.hang_up_at > self.now + ROUND_TRIP_S:
-            self.arrived[message.topic] += 1
-
-    def lose(self) -> None:
-        self.losses, self.lost_at = self.losses + 1, self.now
-        self.topics.note_loss("broker", self.in_flight.first_written(self.now), self.now)
-
-    def run(self, seconds: float) -> Link:
-        for step in range(round(self.now / STEP_S), round((self.now + seconds) / STEP_S)):
-            self.now = step * STEP_S
-            if self.lost_at < 1e9:
-                if self.now - self.lost_at >= 0.1:
-                    self.connect()
-                continue
-            while self.pongs and self.pongs[0] <= self.now and self.pongs[0] < self.hang_up_at:
-                self.pongs.pop(0)
-                self.in_flight.pong(self.now)
-            if self.now >= self.hang_up_at or (self.left and self.now - self.began >= self.every_s):
-                self.left -= self.now < self.hang_up_at
-                self.lose()
-                continue
-            own = {topic: self.message(topic) for topic, (_, _, retained) in ROBOT.items() if retained}
-            for message in self.topics.due(own, "broker", self.now):
-                self.publish(message)
-            for topic, (period_s, _, _) in ROBOT.items():
-                every = max(1, round(period_s / STEP_S))
-                if step % every == every - 1:
-                    self.publish(self.message(topic))
-            if self.now >= self.ping_at:
-                self.ping_at = self.now + 0.45
-                self.in_flight.ping(self.now, None)
-                self.pongs.append(self.now + ROUND_TRIP_S)
-        self.now = round(self.now + STEP_S, 2)
-        return self
-
-    def rates(self, seconds: float) -> dict[str, float]:
-        """Return what share of each topic's messages arrives from now on."""
-        before = self.arrived.copy()
-        self.run(seconds)
-        periods = {topic: period for topic, (period, _, _) in ROBOT.items() if period <= seconds / 4}
-        return {topic: (self.arrived[topic] - before[topic]) * period / seconds for topic, period in periods.items()}
+def sizes(text: str) -> dict[str, int]:
+    return {topic: int(size) for topic, _, size in (word.partition(":") for word in text.split())}
 
 
-def on(*topics: str) -> Refuses:
-    return lambda topic, _size, _now: topic in topics
+@pytest.mark.parametrize(
+    ("losses", "withheld", "refused"),  # after which messages the connection was lost; from which size topics wait
+    [
+        (["a:9"] * 2, "", ""),
+        (["a:9"] * 3, "a:0", "a"),
+        (["a:9", "a:9", "b:9", "a:9"], "", ""),  # not in a row
+        (["a:9", "a:9", None, "a:9"], "", ""),  # it was silent: no message is the reason
+        (["a:9 b:9"] * 3, "a:0 b:0", ""),  # each waits until it is tried
+        (["a:9 r/online:9"] * 3, "a:0", "a"),
+        (["a:9 b:2600"] * 3, "b:1300", "b"),
+        (["r/online:9 r/estop/w:2600"] * 3, "r/estop/w:1300", "r/estop/w"),
+        (["r/online:1500 r/estop/w:2600"] * 3, "r/online:1024 r/estop/w:1024", ""),
+        (["r/online:9 r/estop/w:9"] * 3, "", "r/online r/estop/w"),
+    ],
+)
+def test_what_is_withheld_after_losses(
+    losses: list[str | None], withheld: str, refused: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    topics = RefusedTopics("robot", VITAL)
+    for written in losses:
+        topics.note_loss("broker", None if written is None else sizes(written), 0.0)
+    assert {topic: entry.size for topic, entry in topics.withheld.items()} == sizes(withheld)
+    assert set(topics.not_taken) == set(refused.split())
+    cannot_run = [line for line in caplog.messages if "this account cannot run a robot" in line]
+    assert len(cannot_run) == len(set(refused.split()) - topics.withheld.keys())
+    for topic, entry in topics.withheld.items():
+        taken = [topics.admits(Message(topic, bytes(size)), 0.0) for size in (entry.size, max(0, entry.size - 1))]
+        assert taken == [False, entry.size > 0]
 
 
-@pytest.mark.parametrize("topics", [("r/rare",), ("r/touch", "r/status")])
-def test_what_a_broker_hangs_up_on_costs_that_topic(topics: tuple[str, ...]) -> None:
-    link = Link(on(*topics)).run(300)
-    assert set(link.topics.withheld) == set(topics) == set(link.topics.not_taken)
-    losses = link.losses
-    rates = link.rates(120)
-    assert link.losses - losses <= 3 * len(topics), "each is tried about once a minute"
-    assert [topic for topic, share in rates.items() if topic not in topics and share < 0.9] == []
+def test_withheld_topics_are_tried_one_at_a_time_and_the_one_at_fault_each_minute(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level("INFO")
+    topics, own = RefusedTopics("robot", VITAL), {topic: Message(topic, b"x") for topic in "ab"}
 
+    def due(now: float) -> str:
+        return "".join(message.topic for message in topics.due(own, "broker", now))
 
-@pytest.mark.parametrize("topic", ["r/online", "r/estop/wheels"])
-def test_a_vital_topic_is_never_withheld_and_an_error_names_it(topic: str, caplog: pytest.LogCaptureFixture) -> None:
-    link = Link(lambda name, _size, now: name == topic and now < 100).run(99)
-    assert any("this account cannot run a robot" in line and topic in line for line in caplog.messages)
-    assert topic in link.topics.not_taken
-    assert topic not in link.topics.withheld
-    link.run(90)
-    assert not link.topics.withheld
-    assert min(link.rates(20).values()) > 0.9
-
-
-@pytest.mark.parametrize(("topic", "size"), [("r/capabilities", 24_000), ("r/imu", 24_000), ("r/capabilities", 2_600)])
-def test_a_message_beyond_the_limit_of_a_broker_costs_only_messages_of_that_size(topic: str, size: int) -> None:
-    link = Link(lambda _topic, written, _now: written > size // 2, **{topic[2:]: size}).run(60)
-    assert set(link.topics.withheld) == set(link.topics.not_taken) == {topic}
-    losses, link.sizes[topic] = link.losses, size // 3
-    before = link.arrived[topic]
-    link.publish(link.message(topic))
-    assert link.arrived[topic] > before
-    link.run(60)
-    assert link.losses == losses
-
-
-@pytest.mark.parametrize("every_s", [0.1, 1.0, 10.0])
-def test_a_link_that_is_lost_20_times_costs_topics_for_a_minute_at_most(every_s: float) -> None:
-    link = Link(on(), every_s=every_s, losses=20).run(21 * (every_s + 0.12))
-    assert link.losses == 20
-    assert every_s < 1.5 or not link.topics.not_taken
-    link.run(75)
-    assert not link.topics.withheld
-    assert min(link.rates(20).values()) > 0.95
-
-
-def test_a_broker_that_hangs_up_for_another_reason_costs_no_topic() -> None:
-    """Such as one with a quota of messages: it has accepted the topics before, on the same connection."""
-    count = Counter[str]()
-
-    def refuses(_topic: str, _size: int, _now: float) -> bool:
-        count["all"] += 1
-        return count["all"] % 200 == 0
-
-    link = Link(refuses).run(100)
-    assert link.losses > 20
-    assert not link.topics.not_taken
+    for _ in range(3):
+        topics.note_loss("broker", {"a": 9, "b": 9}, 0.0)
+    assert (due(1.9), due(2.0)) == ("", "a")
+    assert [topics.admits(own[topic], 2.1) for topic in "ab"] == [True, False]
+    topics.note_loss("broker", {"a": 9, "r/online": 9}, 2.5)
+    assert [topics.admits(own["b"], now) for now in (4.4, 4.5)] == [False, True], "a live message begins its trial, too"
+    assert (due(5.4), due(5.5)) == ("", "")
+    assert set(topics.withheld) == set(topics.not_taken) == {"a"}
+    assert (due(62.4), due(62.5), due(63.5)) == ("", "a", "")
+    assert not topics.withheld
+    assert not topics.not_taken
+    assert caplog.messages[-1] == "robot: broker accepts messages on a again"
 
 
 def test_what_is_remembered_is_bounded() -> None:

@@ -263,6 +263,28 @@ def test_a_discarded_connection_sends_nothing_more(link: Link) -> None:
         list(iter(lambda: link.other.recv(1 << 20), b""))
 
 
+def test_a_client_that_leaves_closes_after_the_other_side(link: Link) -> None:
+    """Else what that sends meanwhile has the connection reset, and a proxy may lose DISCONNECT with it."""
+    parts = list[bytes]()
+
+    def end() -> None:
+        while not b"".join(parts).endswith(packets.DISCONNECT):
+            parts.append(link.other.recv(4096))
+        for _ in range(3):
+            link.other.sendall(PONG)
+            time.sleep(0.01)
+        parts.append(link.other.recv(4096))  # a reset would raise
+        link.other.close()
+
+    other = threading.Thread(target=end)
+    other.start()
+    link.connection.publish(Message("a", b"1", QoS.DELIVERED))
+    link.connection.disconnect()
+    assert link.connection.client.socket is None
+    other.join()
+    assert parts[-1] == b""
+
+
 def test_a_broker_without_qos_1_is_sent_no_more_than_its_socket_takes_but_stops(link: Link) -> None:
     link.connection.limits = Limits(qos=0)
     link.owner.policy.is_stop = lambda topic: topic == "stop"

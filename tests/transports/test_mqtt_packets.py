@@ -1,91 +1,24 @@
-"""What a client writes and reads is what paho writes and reads; what it does where no broker would show it; its id."""
+"""What a client writes and reads, byte by byte; how much it may send; its id."""
 
 from __future__ import annotations
 
 import random
 import re
-import select
-import socket
-import struct
-import threading
-import time
-from collections.abc import Callable, Iterator
-from contextlib import closing
-from itertools import product
+from collections.abc import Callable
 from typing import Any
 
 import pytest
-from paho.mqtt.client import Client as PahoClient
-from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
-from paho.mqtt.packettypes import PacketTypes
-from paho.mqtt.properties import Properties
-from paho.mqtt.reasoncodes import ReasonCode
-from paho.mqtt.subscribeoptions import SubscribeOptions
 
-from pebble.transports import MqttSettings
 from pebble.transports.base import Message, QoS
-from pebble.transports.hosts import addresses_of
-from pebble.transports.mqtt import packets, reasons
-from pebble.transports.mqtt.client import Client, Opening, SendQuota
+from pebble.transports.mqtt import packets
+from pebble.transports.mqtt.client import SendQuota
 from pebble.transports.mqtt.client_ids import unique
 from pebble.transports.mqtt.packets import ANY_QOS, MAX_PACKET, RETAIN, Accepted, Filter, MalformedError, Reader
-from tests.kit.mqtt_bytes import packet
-from tests.support import until
+from tests.kit.mqtt_bytes import packet, text
 
 NO_QUOTA = SendQuota(lambda _packet: None)
-V3, V5 = MQTTProtocolVersion.MQTTv311, MQTTProtocolVersion.MQTTv5
 Seen = tuple[Any, ...]
-Pahos = Callable[..., "Paho"]
 both_versions = pytest.mark.parametrize("modern", [False, True])
-
-
-class Paho:
-    """A client of paho's, and the other end of its connection."""
-
-    def __init__(self, client: PahoClient, keepalive_s: int = 60) -> None:
-        self.client = client
-        with socket.create_server(("127.0.0.1", 0)) as server:
-            client.connect(*server.getsockname(), keepalive_s)
-            self.other, _ = server.accept()
-        self.hello = self.written()
-
-    def written(self) -> bytes:
-        """What has arrived at the other end."""
-        parts = []
-        while self.client.want_write() or select.select([self.other], [], [], 0.005)[0]:
-            self.client.loop_write()
-            if select.select([self.other], [], [], 0)[0]:
-                parts.append(self.other.recv(1 << 20))
-                if not parts[-1]:
-                    break
-        return b"".join(parts)
-
-    def reads(self, data: bytes, count: int) -> list[Seen]:
-        """The first publications in ``data``."""
-        seen = list[Seen]()
-        self.client.on_message = lambda _client, _data, raw: seen.append(
-            (raw.topic.encode(), bytes(raw.payload), raw.qos, raw.retain)
-        )
-        sending = threading.Thread(target=self.other.sendall, args=(data,))
-        sending.start()
-        while len(seen) < count:
-            self.client.loop_read()
-        sending.join()
-        return seen
-
-
-@pytest.fixture
-def pahos() -> Iterator[Pahos]:
-    made: list[Paho] = []
-
-    def make(*, modern: bool, **options: Any) -> Paho:
-        made.append(Paho(PahoClient(CallbackAPIVersion.VERSION2, protocol=V5 if modern else V3, **options)))
-        return made[-1]
-
-    yield make
-    for one in made:
-        one.other.close()
-        one.client.disconnect()
 
 
 class Noted:
@@ -118,100 +51,74 @@ def read(data: bytes, *, modern: bool, pieces: int = 1, most: int = 64, skipped:
     return noted, reader
 
 
-class TestWritten:
-    """The same bytes as paho writes."""
-
-    @both_versions
-    @pytest.mark.parametrize("login", [(None, None), ("user", None), ("user", "pässword"), (None, "unused")])
-    @pytest.mark.parametrize("will", [None, Message("a/ü", b"\xffgone", QoS.DELIVERED, True), Message("b", b"")])
-    def test_connect(self, modern: bool, login: tuple[str | None, str | None], will: Message | None) -> None:
-        client = PahoClient(CallbackAPIVersion.VERSION2, protocol=V5 if modern else V3, client_id="goob-1")
-        client.username_pw_set(*login)
-        if will is not None:
-            client.will_set(will.topic, will.payload, int(will.qos), will.retain)
-        username, password = login
-        options: Any = {"modern": modern, "bridge": False, "keepalive_s": 15, "will": will}
-        ours = packets.connect("goob-1", username=username, password=password, **options)
-        paho = Paho(client, 15)
-        assert ours == paho.hello
-        paho.other.close()
-
-    def test_bridge_mode(self) -> None:
-        client = PahoClient(CallbackAPIVersion.VERSION2, protocol=V3, client_id="b")
-        client.enable_bridge_mode()
-        options: Any = {"will": None, "username": None, "password": None}
-        paho = Paho(client)
-        assert packets.connect("b", modern=False, bridge=True, keepalive_s=60, **options) == paho.hello
-        paho.other.close()
-
-    @both_versions
-    @pytest.mark.parametrize("qos", [0, 1])
-    def test_publish(self, pahos: Pahos, modern: bool, qos: int) -> None:
-        paho = pahos(modern=modern)
-        properties = Properties(PacketTypes.PUBLISH)
-        properties.MessageExpiryInterval = 70_000
-        for retain, size in product((False, True), (0, 127, 128, 20_000, 3_000_000)):
-            for given, expires_s in ((None, None), (properties, 70_000))[: 1 + modern]:
-                mid = paho.client.publish("a/ü", bytes(size), qos, retain, given).mid
-                ours = packets.publish("a/ü", bytes(size), qos, mid, retain=retain, modern=modern, expires_s=expires_s)
-                assert ours == paho.written()
-
-    def test_subscribe_and_disconnect(self, pahos: Pahos) -> None:
-        paho, flags = pahos(modern=True), (False, True)
-        for no_local, as_published, sends_retained in product(flags, flags, flags):
-            handling = {True: SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE, False: SubscribeOptions.RETAIN_DO_NOT_SEND}[
-                sends_retained
-            ]
-            options = SubscribeOptions(1, no_local, as_published, handling)
-            _, mid = paho.client.subscribe([("a/#", options), ("b", options)])
-            wanted = [Filter(text, 1, no_local, as_published, sends_retained) for text in ("a/#", "b")]
-            assert packets.subscribe(mid or 0, wanted, modern=True) == paho.written()
-        paho = pahos(modern=False)
-        paho.client.subscribe([("a/#", 1), ("b", 0)])
-        assert packets.subscribe(1, [Filter("a/#", 1, True), Filter("b", 0)], modern=False) == paho.written()
-        paho.client.disconnect()
-        assert paho.written() == packets.DISCONNECT
-
-    @both_versions
-    def test_unsubscribe(self, pahos: Pahos, modern: bool) -> None:
-        paho = pahos(modern=modern)
-        paho.client.unsubscribe(["a/#", "b"])
-        assert packets.unsubscribe(1, ["a/#", "b"], modern=modern) == paho.written()
-
-    def test_a_text_that_is_too_long_is_refused(self) -> None:
-        with pytest.raises(ValueError, match="65536 bytes where MQTT has room for 65535"):
-            packets.unsubscribe(1, ["a" * 65_536], modern=False)
+def connect(*, modern: bool = False, bridge: bool = False, **given: Any) -> bytes:
+    options: dict[str, Any] = {"keepalive_s": 300, "will": None, "username": None, "password": None, **given}
+    return packets.connect("g", modern=modern, bridge=bridge, **options)
 
 
-def publication(rng: random.Random, *, modern: bool) -> bytes:
-    """A PUBLISH of QoS 0 or 1, perhaps with properties, an odd topic, or of any length."""
-    first = 0x30 | rng.choice((0, 2)) | rng.choice((0, 1)) | rng.choice((0, 8))
-    topic = rng.choice((b"a/b", "ü/ß".encode(), b"pebble/robots/goob/outgoing/online"))
-    body = struct.pack("!H", len(topic)) + topic + (rng.randbytes(2) if first & 2 else b"")
+def publish(topic: str, qos: int, *, modern: bool, retain: bool = False, expires_s: int | None = None) -> bytes:
+    return packets.publish(topic, b"x", qos, 258, retain=retain, modern=modern, expires_s=expires_s)
+
+
+LOGIN = {"username": "u", "password": "p\xe4", "will": Message("a/\xfc", b"\xff!", QoS.DELIVERED, True)}
+FILTERS = [Filter("a/#", 1, no_local=True, as_published=True, sends_retained=False), Filter("b", 0)]
+#: What is written, as MQTT's chapter 3 has it: 3.1.1 and 5.
+WRITTEN = [
+    (connect(password="unused"), "100d 0004 4d515454 04 02 012c 0001 67"),
+    (connect(modern=True), "100e 0004 4d515454 05 02 012c 00 0001 67"),
+    (connect(bridge=True), "100d 0004 4d515454 84 02 012c 0001 67"),
+    (connect(**LOGIN), "101f 0004 4d515454 04 ee 012c 0001 67 0004 612fc3bc 0002 ff21 0001 75 0003 70c3a4"),
+    (
+        connect(modern=True, **LOGIN),
+        "1021 0004 4d515454 05 ee 012c 00 0001 67 00 0004 612fc3bc 0002 ff21 0001 75 0003 70c3a4",
+    ),
+    (connect(username="u", will=Message("b", b"")), "1015 0004 4d515454 04 86 012c 0001 67 0001 62 0000 0001 75"),
+    (publish("a/\xfc", 0, modern=False), "3007 0004 612fc3bc 78"),
+    (publish("a", 1, modern=False, retain=True), "3306 0001 61 0102 78"),
+    (publish("a", 0, modern=True), "3005 0001 61 00 78"),
+    (publish("a", 1, modern=True, expires_s=70_000), "320c 0001 61 0102 05 02 00011170 78"),
+    (publish("a" * 124, 0, modern=False)[:5], "307f 007c 61"),
+    (publish("a" * 125, 0, modern=False)[:6], "308001 007d 61"),
+    (publish("a" * 20_000, 0, modern=False)[:5], "30a39c01 4e"),
+    (packets.subscribe(258, FILTERS, modern=False), "820c 0102 0003 612f23 01 0001 62 00"),
+    (packets.subscribe(258, FILTERS, modern=True), "820d 0102 00 0003 612f23 2d 0001 62 00"),
+    (packets.unsubscribe(258, ["a/#", "b"], modern=False), "a20a 0102 0003 612f23 0001 62"),
+    (packets.unsubscribe(258, ["a/#", "b"], modern=True), "a20b 0102 00 0003 612f23 0001 62"),
+]
+
+
+@pytest.mark.parametrize(("ours", "wanted"), WRITTEN)
+def test_what_is_written(ours: bytes, wanted: str) -> None:
+    assert ours == bytes.fromhex(wanted)
+
+
+def test_a_text_that_is_too_long_is_refused() -> None:
+    with pytest.raises(ValueError, match="65536 bytes where MQTT has room for 65535"):
+        packets.unsubscribe(1, ["a" * 65_536], modern=False)
+
+
+def publication(rng: random.Random, *, modern: bool) -> tuple[bytes, Seen]:
+    """A PUBLISH of QoS 0 or 1, perhaps with properties, an odd topic, or of any length; and what it means."""
+    qos, retain, duplicate = (rng.choice((0, 1)) for _ in range(3))
+    topic = rng.choice((b"a/b", "\xfc/\xdf".encode(), b"pebble/robots/goob/outgoing/online"))
+    body = text(topic) + (rng.randbytes(2) if qos else b"")
     if modern:
-        properties = Properties(PacketTypes.PUBLISH)
-        if rng.random() < 0.3:
-            properties.MessageExpiryInterval = rng.randrange(1, 9)
-        if rng.random() < 0.3:
-            properties.UserProperty = ("key", "v" * rng.choice((1, 200)))
-        body += properties.pack()
-    body += rng.randbytes(rng.choice((0, 1, 40, 120, 3000)))
-    return packet(first, body)
+        expiry = rng.choice((b"", b"\2" + rng.randbytes(4)))
+        properties = expiry + rng.choice((b"", *(b"\x26" + text(b"key") + text(bytes(size)) for size in (1, 200))))
+        body += packet(0, properties)[1:]
+    payload = rng.randbytes(rng.choice((0, 1, 40, 120, 3000)))
+    return packet(0x30 | duplicate << 3 | qos << 1 | retain, body + payload), (topic, payload, qos, bool(retain))
 
 
 class TestRead:
     @both_versions
     @pytest.mark.parametrize("pieces", [1, 2, 50, 4000])
-    def test_publications_are_read_as_paho_reads_them_in_any_pieces(
-        self, pahos: Pahos, modern: bool, pieces: int
-    ) -> None:
+    def test_publications_are_read_in_any_pieces(self, modern: bool, pieces: int) -> None:
         rng = random.Random(pieces)
-        data = b"".join(publication(rng, modern=modern) for _ in range(500))
-        noted, reader = read(data, modern=modern, pieces=pieces)
-        assert noted.seen == pahos(modern=modern).reads(packet(0x20, b"\0\0" + modern * b"\0") + data, 500)
-        assert len(noted.seen) == 500
-        asked = sum(qos for _, _, qos, _ in noted.seen)
-        assert len(reader.acks) == 4 * asked > 400
+        sent = [publication(rng, modern=modern) for _ in range(500)]
+        noted, reader = read(b"".join(raw for raw, _ in sent), modern=modern, pieces=pieces)
+        assert noted.seen == [meaning for _, meaning in sent]
+        assert len(reader.acks) == 4 * sum(qos for _, (_, _, qos, _) in sent) > 400
         assert reader.unread == len(reader.partial) == 0
 
     def test_no_more_than_asked_for(self) -> None:
@@ -248,11 +155,10 @@ class TestRead:
         assert bytes(reader.acks) == b"\x70\2\1\5"  # PUBCOMP
 
     def test_what_a_broker_allows(self) -> None:
-        properties = Properties(PacketTypes.CONNACK)
-        properties.ReceiveMaximum, properties.MaximumPacketSize, properties.AssignedClientIdentifier = 20, 4096, "me"
-        properties.UserProperty = [("a", "b"), ("c", "d")]
-        properties.ServerKeepAlive, properties.RetainAvailable, properties.MaximumQoS = 30, 0, 0
-        noted, _ = read(packet(0x20, b"\0\0" + properties.pack()), modern=True)
+        texts = b"\x12" + text("me") + b"\x26" + text("a") + text("b") + b"\x26" + text("c") + text("d")
+        numbers = b"\x21\0\x14" + b"\x27\0\0\x10\0" + b"\x13\0\x1e" + b"\x25\0" + b"\x24\0"
+        properties = packet(0, texts + numbers)[1:]  # their length, and all of them
+        noted, _ = read(packet(0x20, b"\0\0" + properties), modern=True)
         assert noted.seen == [("accepted", Accepted(max_packet=4096, receive_maximum=20, max_qos=0, retain=0))]
 
     @both_versions
@@ -315,104 +221,22 @@ class TestRead:
         assert 500 < refused < 2000
 
 
-def test_reasons_are_called_as_paho_calls_them() -> None:
-    for code in range(0x80, 0xA3):
-        name = ReasonCode(PacketTypes.DISCONNECT, identifier=0x80).names.get(code)
-        if name is not None:
-            assert reasons.words(code).lower() == next(iter(name)).lower()
+def test_no_more_is_in_flight_than_the_broker_takes() -> None:
+    sent = list[bytes]()
+    quota = SendQuota(sent.append)
+    reader = Reader(Noted(), quota, modern=True)
 
+    def receives(data: bytes) -> list[bytes]:
+        reader.feed(data)
+        reader.read(9)
+        return sent
 
-# -- against the other end of its socket
-
-
-RECEIVE_MAXIMUM_2 = packet(0x20, b"\0\0\3\x21\0\2")
-
-
-class Pair:
-    """A client, and the other end of its connection."""
-
-    def __init__(self) -> None:
-        with socket.create_server(("127.0.0.1", 0)) as server:
-            settings = MqttSettings(host="127.0.0.1", port=server.getsockname()[1], protocol="5")
-            opening = Opening("client", settings, None, None, addresses_of(settings.host, settings.port)[0])
-            self.client = Client(opening, Noted(), bridge=False)
-            self.client.open()
-            self.other, _ = server.accept()
-        self.written()  # CONNECT
-
-    def written(self) -> bytes:
-        """What has arrived at the other end."""
-        select.select([self.other], [], [], 1)
-        self.other.setblocking(False)
-        parts = []
-        try:
-            while part := self.other.recv(1 << 20):
-                parts.append(part)
-        except BlockingIOError:
-            pass
-        return b"".join(parts)
-
-    def sends(self, data: bytes) -> None:
-        """The other end does, and the client reads it."""
-        self.other.setblocking(True)
-        self.other.sendall(data)
-        assert until(lambda: self.client.receive() == len(data))
-        self.client.read(64)
-
-    def close(self) -> None:
-        self.client.close()
-        self.other.close()
-
-
-@pytest.fixture
-def pair() -> Iterator[Pair]:
-    with closing(Pair()) as pair:
-        yield pair
-
-
-def publish(client: Client, number: int) -> None:
-    client.publish("a", b"%d" % number, 1, retain=False, expires_s=None)
-
-
-def test_no_more_is_in_flight_than_the_broker_takes(pair: Pair) -> None:
-    pair.sends(RECEIVE_MAXIMUM_2)
-    for number in range(5):
-        publish(pair.client, number)
-    client_sent = [
-        packets.publish("a", b"%d" % n, 1, n + 1, retain=False, modern=True, expires_s=None) for n in range(5)
-    ]
-    assert pair.written() == b"".join(client_sent[:2])
-    pair.sends(packet(0x40, b"\0\1"))
-    assert pair.written() == client_sent[2]
-    pair.sends(packet(0x40, b"\0\2") + packet(0x40, b"\0\3"))
-    assert pair.written() == b"".join(client_sent[3:])
-    pair.sends(packet(0x40, b"\0\4") + 5 * packet(0x40, b"\0\5"))  # more answers than were asked for allow no more
-    for number in range(3):
-        publish(pair.client, number)
-    assert len(pair.written()) == 2 * len(client_sent[0])
-
-
-def test_a_client_that_leaves_closes_after_the_other_side(pair: Pair) -> None:
-    """Else what that sends meanwhile has the connection reset, and a proxy may lose DISCONNECT with it."""
-    parts = list[bytes]()
-
-    def end() -> None:
-        while not b"".join(parts).endswith(packets.DISCONNECT):
-            parts.append(pair.other.recv(4096))
-        for _ in range(3):
-            pair.other.sendall(b"\xd0\0")
-            time.sleep(0.01)
-        parts.append(pair.other.recv(4096))  # a reset would raise
-        pair.other.close()
-
-    pair.other.setblocking(True)
-    other = threading.Thread(target=end)
-    other.start()
-    publish(pair.client, 1)
-    pair.client.disconnect()
-    assert pair.client.socket is None
-    other.join()
-    assert parts[-1] == b""
+    receives(packet(0x20, b"\0\0\3\x21\0\2"))  # CONNACK: Receive Maximum 2
+    assert [quota.takes(b"%d" % number) for number in range(5)] == [True, True, False, False, False]
+    assert receives(packet(0x40, b"\0\1")) == [b"2"]
+    assert receives(packet(0x40, b"\0\2") + packet(0x40, b"\0\3")) == [b"2", b"3", b"4"]
+    receives(packet(0x40, b"\0\4") + 5 * packet(0x40, b"\0\5"))  # more answers than were asked for allow no more
+    assert [quota.takes(b"x") for _ in range(3)] == [True, True, False]
 
 
 @pytest.mark.parametrize(

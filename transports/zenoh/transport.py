@@ -19,7 +19,9 @@ import zenoh
 from pebble.errors import TransportError
 from pebble.transports import clock
 from pebble.transports.ages import MessageAges
-from pebble.transports.base import Message, State, Subscription, Transport
+from pebble.transports.base import QUEUE_BYTES, QUEUE_LIMIT, Message, State, Subscription, Transport
+from pebble.transports.bounds import BoundedQueue
+from pebble.transports.counters import Counters
 from pebble.transports.peers import PeerRegistry, PresenceLock, new_name, prepare_run_dir
 from pebble.transports.settings import ZenohSettings
 from pebble.transports.topics import is_pattern
@@ -28,7 +30,6 @@ from pebble.transports.zenoh import wire
 from pebble.transports.zenoh.callbacks import direct
 from pebble.transports.zenoh.hub_connection import GOODBYE_S, HUB_ANSWER_S, HubConnection
 from pebble.transports.zenoh.keymap import filter_to_key, key_to_topic
-from pebble.transports.zenoh.loopback_queue import LoopbackQueue
 from pebble.transports.zenoh.presence import Barrier, HubView, HubWatch
 from pebble.transports.zenoh.publishers import Publishers
 
@@ -38,6 +39,49 @@ OPEN_SYNC_S = 1.0  # the longest wait for siblings that do not answer, when open
 SYNC_S = 0.5  # and when subscribing or reconnecting to the hub
 _RETRY_S = 0.2
 _START = "is the robot up? `pebble up CONFIG` starts it"
+
+
+class LoopbackQueue:
+    """A queue that hands a transport's own messages to its own direct handlers, on a thread of its own.
+
+    The thread starts with the first message. Zenoh delivers to subscribers of the same session inside ``put()``. A
+    direct handler called there would run under the publisher's lock, and two that publish to each other would deadlock.
+    """
+
+    def __init__(self, counters: Counters) -> None:
+        self._counters = counters
+        self._arrived = threading.Condition()
+        self._queue = BoundedQueue[tuple[Subscription, Message]](QUEUE_LIMIT, QUEUE_BYTES)
+        self._thread: threading.Thread | None = None
+        self._closed = False
+
+    def put(self, subscription: Subscription, message: Message) -> None:
+        with self._arrived:
+            if self._closed:
+                return
+            for _lost in self._queue.append((subscription, message), len(message.topic) + len(message.payload)):
+                self._counters.add("dropped")
+            self._arrived.notify()
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._run, name="pebble-echo", daemon=True)
+                self._thread.start()
+
+    def close(self) -> None:
+        with self._arrived:
+            self._closed = True
+            self._queue.clear()
+            self._arrived.notify()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join(1.0)
+
+    def _run(self) -> None:
+        while True:
+            with self._arrived:
+                self._arrived.wait_for(lambda: self._queue or self._closed)
+                if self._closed:
+                    return
+                subscription, message = self._queue.popleft()
+            subscription.offer(message)
 
 
 class ZenohTransport(Transport):

@@ -17,9 +17,8 @@ from pebble.errors import PebbleError, TransportError
 from pebble.extensions.fleet import certificates
 from pebble.extensions.page.app import create_app
 from pebble.extensions.page.setting import WebSettings
+from pebble.transports.credentials import no_password
 from pebble.transports.renewed import Renewed
-from pebble.transports.socket_holders import why_not
-from pebble.transports.tls import no_password
 
 _LARGEST_MESSAGE = 64 * 1024
 _END_S = 1
@@ -145,8 +144,8 @@ def listen(settings: WebSettings) -> socket.socket:
     except OSError as error:
         listener.close()
         raise PebbleError(
-            f"cannot listen on {settings.host} port {settings.port}: {why_not(error, settings.port)};"
-            " choose another with --port"
+            f"cannot listen on {settings.host} port {settings.port}: {error.strerror};"
+            " choose another with --port (`sudo ss -ltnp` names who has it)"
         ) from None
     return listener
 

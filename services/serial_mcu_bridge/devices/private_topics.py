@@ -10,7 +10,7 @@ from typing import Any
 from pebble.contract import MCU_COMMAND, MCU_DESCRIBE, MCU_LOCAL_ONLY, MCU_VALUE, codec, is_reserved
 from pebble.contract.payloads import McuLocalOnly
 from pebble.errors import PayloadError
-from pebble.forwarding.private_topics import PrivateTopics
+from pebble.forwarding.observer import PrivateTopics
 from pebble.transports import Message
 
 _DEVICES = 256  # remembered; a robot has a handful

@@ -17,12 +17,10 @@ from typing import Any
 import pytest
 
 from pebble.config import Config, parse
-from pebble.forwarding import side as side_module
 from pebble.forwarding.routing import Drop, Side
 from pebble.forwarding.service import ForwardingService
 from pebble.forwarding.side import Gate
 from pebble.runtime.connections import local_transport
-from pebble.services.mqtt_bridge.requests.media import Media
 from pebble.transports import MqttSettings, State, Transport, ZenohSettings, create
 from tests.forwarding.virtual import SERVICES
 from tests.services.mqtt_bridge.bridge_rig import Client, Quiet, Running, make_config
@@ -38,36 +36,15 @@ _numbers = count(1)
 
 
 class MqttEnd:
-    """A mosquitto, or another broker of a test's own, and a way to it for the service.
+    """A mosquitto, or another broker of a test's own, and a way to it for the service."""
 
-    An end can lose what it retains, or get an older save back.
-    """
-
-    def __init__(
-        self, folder: Path, protocol: str = "3.1.1", *, keeps: bool = False, broker: Broker | AmqttBroker | None = None
-    ) -> None:
-        self.broker = broker or Broker(folder, persistence=keeps)
+    def __init__(self, folder: Path, protocol: str = "3.1.1", *, broker: Broker | AmqttBroker | None = None) -> None:
+        self.broker = broker or Broker(folder)
         self.link = TcpProxy(self.broker.port)
         self.section: dict[str, Any] = {"host": "127.0.0.1", "port": self.link.port, "protocol": protocol}
-        self._saved: dict[Path, bytes] = {}
 
     def transport(self, name: str) -> Transport:
         return create("mqtt", name, MqttSettings(**{**self.section, "port": self.broker.port, "as_published": True}))
-
-    def stop(self) -> None:
-        assert isinstance(self.broker, Broker)
-        self.broker.kill()
-
-    def save(self) -> None:
-        assert isinstance(self.broker, Broker)
-        self.broker.save()
-        self._saved = {file: file.read_bytes() for file in self.broker.store.glob("*.db")}  # not a half-written .new
-
-    def restore(self) -> None:
-        """Start again, with what was there at the last :meth:`save`; without one with nothing."""
-        for file, data in self._saved.items():
-            file.write_bytes(data)
-        self.broker.start()
 
     def close(self) -> None:
         self.link.stop()
@@ -79,9 +56,8 @@ class ZenohEnd:
 
     section: dict[str, Any]  # of a config
 
-    def __init__(self, folder: Path, *, keeps: bool = False, uplink: bool = False) -> None:
-        self._journal = folder / "journal" if keeps else None
-        self._hub = HubProcess(folder / ("uplink" if uplink else "run"), self._journal)
+    def __init__(self, folder: Path, *, uplink: bool = False) -> None:
+        self._hub = HubProcess(folder / ("uplink" if uplink else "run"))
         # a machine that stands still for the usual two seconds would make live messages late, and they would be dropped
         settings = replace(self._hub.settings, lease_ms=5000)
         if uplink:
@@ -97,22 +73,8 @@ class ZenohEnd:
     def transport(self, name: str) -> Transport:
         return create("zenoh", name, self._settings)
 
-    def stop(self) -> None:
-        self._hub.kill()
-
-    def save(self) -> None:
-        assert self._journal is not None
-        self._hub.wait_until_stored()
-        self._saved = self._journal.read_bytes()
-
-    def restore(self) -> None:
-        if self._journal is not None:
-            self._journal.write_bytes(self._saved)
-        self._hub.start()
-
     def close(self) -> None:
-        if self._hub.running:
-            self._hub.end()
+        self._hub.end()
 
 
 End = MqttEnd | ZenohEnd
@@ -136,10 +98,6 @@ class Rig:
     def clients(self) -> dict[Side, Client]:
         return {LOCAL: self.local, REMOTE: self.remote}
 
-    @property
-    def gate(self) -> Gate:
-        return self.service.forwarder.gate
-
     def client(self, side: Side) -> Client:
         """One more on that side; none receives its own messages."""
         transport = self.ends[side].transport(f"{self.robot}-{side.value}-{len(self._clients)}")
@@ -156,20 +114,9 @@ class Rig:
 
     def wait_ready(self) -> None:
         """Until the service forwards, or has found out that it must not."""
-        assert until(lambda: self.gate is not Gate.WAITING), "it never made up its mind"
-        assert until(lambda: self.gate is Gate.SHUT or self.synchronized)
-
-    @property
-    def synchronized(self) -> bool:
-        return self.service.forwarder.retained.synchronized(*Side)
-
-    def transport(self, side: Side) -> Transport:
-        """The service's own."""
-        return {LOCAL: self.service.transport, REMOTE: self.service.remote}[side]
-
-    def connections(self, side: Side) -> int:
-        """How many connections of the service there have been; the newest one is subscribed to again."""
-        return self.transport(side).counters["connected"] * (self.transport(side).state is State.CONNECTED)
+        forwarder = self.service.forwarder
+        assert until(lambda: forwarder.gate is not Gate.WAITING), "it never made up its mind"
+        assert until(lambda: forwarder.gate is Gate.SHUT or forwarder.retained.synchronized(*Side))
 
     def retained(self, side: Side) -> dict[str, bytes]:
         """What a late subscriber finds on that side, but what the bridge itself publishes there."""
@@ -347,58 +294,3 @@ def test_stops_flags_and_commands_arrive_and_come_to_rest_without_bridge_mode(ma
     assert (rig.remote.payloads(VIDEO_FLAG)[-1], rig.local.payloads(AUDIO_FLAG)[-1]) == (FALSE, TRUE)
     too_late = rig.service.forwarder.counters[f"remote: {Drop.LATE.value}"]  # on a busy machine, behind the flags
     assert len(rig.local.on("incoming/flags/git-pull")) + too_late == 1
-
-
-#: The service, both ends, and which of them is restored: the one whose programs set the microphone, too.
-RESTORED_LINKS: dict[str, tuple[str, Callable[[Path], End], Callable[[Path], End], Side]] = {
-    "bridge, the robot's broker": ("bridge", partial(MqttEnd, keeps=True), MqttEnd, LOCAL),
-    "bridge, the robot's hub": ("bridge", partial(ZenohEnd, keeps=True), MqttEnd, LOCAL),
-    "mirror, its broker": ("mirror", ZenohEnd, partial(MqttEnd, keeps=True), REMOTE),
-}
-#: The link, how long its side is away, and who sets the microphone, in order: an operator, a program on the robot that
-#: lives on, and one that is not asked to repeat what it set. ``longer``: than an outage in which an operator could
-#: choose an earlier value again. In the end the microphone is switched off, after the save.
-RESTORED = [
-    ("bridge, the robot's broker", "longer", "save operator:on once:off"),
-    ("bridge, the robot's hub", "while the robot is off", "once:on save operator:off"),
-    ("mirror, its broker", "longer", "program:on save program:off"),
-    ("bridge, the robot's broker", "briefly", "operator:on save operator:off"),
-]
-
-
-@pytest.mark.parametrize(("link", "when", "history"), RESTORED)
-def test_a_microphone_that_was_switched_off_stays_off_when_a_side_is_restored(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: Make, link: str, when: str, history: str
-) -> None:
-    monkeypatch.setattr(side_module, "RESTORED_S", 0.0 if when == "longer" else 30.0)
-    off, allowed = when == "while the robot is off", list[bool]()
-    monkeypatch.setattr(Media, "allow", lambda _media, _flag, on: allowed.append(on))
-    service, local, remote, restored = RESTORED_LINKS[link]
-    rig = make(service, local(tmp_path), remote(tmp_path))
-    rig.start()
-    operator, end = rig.clients[restored.other], rig.ends[restored]
-    setters = {"operator": operator, "program": rig.clients[restored], "once": rig.client(restored)}
-
-    def set_microphone(who: str, value: bytes) -> None:
-        others = [client for name, client in setters.items() if name != who]
-        setters[who].publish(AUDIO_FLAG, value, retain=True, remember=who == "program")
-        assert until(lambda: all(client.payloads(AUDIO_FLAG)[-1:] == [value] for client in others))
-        assert until(lambda: rig.service.forwarder.retained.value(f"{rig.base}/{AUDIO_FLAG}") == value)
-
-    for word in history.split():
-        who, _, value = word.partition(":")
-        set_microphone(who, TRUE if value == "on" else FALSE) if value else end.save()
-    assert service == "mirror" or until(lambda: allowed[-1:] == [False])
-    before, seen = rig.connections(restored), len(operator.on(AUDIO_FLAG))
-    if off:
-        rig.close()
-    allowed.clear()
-    end.stop()
-    assert off or until(lambda: not rig.connections(restored))
-    end.restore()
-    if off:
-        rig.start()
-    else:
-        assert until(lambda: rig.connections(restored) > before and rig.synchronized)
-    assert until(lambda: {rig.retained(side).get(AUDIO_FLAG) for side in Side} == {FALSE})
-    assert (True in allowed, TRUE in operator.payloads(AUDIO_FLAG)[seen:]) == (False, False)

@@ -23,7 +23,6 @@ import pytest
 import zenoh
 
 from pebble.errors import TransportError
-from pebble.extensions.lab.bench.usage import pss_mb
 from pebble.transports import Message, QoS, State, TlsSettings, ZenohSettings, create
 from pebble.transports.zenoh import publishers, transport, wire
 from pebble.transports.zenoh import session as sessions
@@ -196,29 +195,17 @@ def test_a_stopped_sibling_does_not_delay_the_others(robot: ZenohNet) -> None:
 
 
 def test_more_topics_than_publishers_are_received_in_order(robot: ZenohNet, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also those that strangers invent: Zenoh stores 2.4 KB in the hub for each key that ever had a publisher."""
     monkeypatch.setattr(publishers, "PUBLISHERS", 3)
     received: dict[str, list[int]] = {}
     robot.client("receiver").subscribe("many/+", lambda m: received.setdefault(m.topic, []).append(int(m.payload)))
-    sender = robot.client("sender")
+    sender: Any = robot.client("sender")
+    sender.policy.is_invented = lambda topic: topic == "many/0"
     for number in range(70):
         assert sender.publish(f"many/{number % 7}", b"%d" % number, qos=QoS(number % 2), urgent=number % 3 == 0)
     assert until(lambda: sum(map(len, received.values())) == 70)
     assert received == {f"many/{topic}": list(range(topic, 70, 7)) for topic in range(7)}
-
-
-def test_topics_that_strangers_invent_take_no_memory(robot: ZenohNet) -> None:
-    """Zenoh stores 2.4 KB in the hub for each key that ever had a publisher: these would be 14 MB more."""
-    sender, hub = robot.client("sender"), robot.hub.pid
-    sender.policy.is_invented = lambda topic: topic != "invented/0"
-    numbers = []
-    robot.client("receiver").subscribe("invented/+", lambda message: numbers.append(int(message.payload)))
-    before = pss_mb(hub)
-    for part in range(0, 6000, 500):  # what waits in the hub would count as its memory
-        for number in range(part, part + 500):
-            assert sender.publish(f"invented/{number}", b"%d" % number, qos=DELIVERED)
-        assert until(lambda due=part + 500: len(numbers) == due)  # type: ignore[misc]
-    assert numbers == list(range(6000))
-    assert pss_mb(hub) < before + 8.0
+    assert [topic for topic, _ in sender._publishers.declared] == ["many/1", "many/2", "many/3"]
 
 
 def test_retained_state_missed_while_one_connection_was_down_comes_with_it(robot: ZenohNet) -> None:
@@ -499,7 +486,7 @@ def test_a_taken_port_keeps_no_robot_from_its_hub(tmp_path: Path, caplog: pytest
     with socket.create_server(("127.0.0.1", 0)) as stranger:
         endpoint = f"tcp/localhost:{stranger.getsockname()[1]}#iface=lo"
         settings = ZenohSettings(run_dir=tmp_path / "run", listen=(endpoint,))
-        fact = f"transport.listen: {endpoint}: Address already in use (by process {os.getpid()} of user {os.getuid()}: "
+        fact = f"transport.listen: {endpoint}: Address already in use (`sudo ss -lntup` names the process)"
         with pytest.raises(TransportError, match=re.escape(fact)):  # its endpoints are all that it is for
             ZenohHub(settings).open()
         hub = ZenohHub(replace(settings, of_robot=True)).open()

@@ -19,7 +19,6 @@ from pebble.transports.counters import Counters
 from pebble.transports.peers import FileLock, PeerRegistry, new_name, prepare_run_dir
 from pebble.transports.renewed import Renewed
 from pebble.transports.settings import ZenohSettings
-from pebble.transports.socket_holders import why_not
 from pebble.transports.zenoh.hub.admission import Admission
 from pebble.transports.zenoh.hub.store import HubStore
 from pebble.transports.zenoh.hub.worker import HubWorker
@@ -48,15 +47,6 @@ class ZenohHub:
 
             self._certificates = renewed_context(settings.tls)
         self._used = self._newest  # certificates and rules of the session; before it opens, those in the files
-
-    @property
-    def refused_wills(self) -> int:
-        return self._admission.refused
-
-    @property
-    def refused(self) -> int:
-        """The number of retained messages and wills for which there was no room."""
-        return 0 if self.store is None else self.store.refused
 
     def open(self) -> ZenohHub:
         """Start the hub. Raises TransportError if the run directory has a hub already, or cannot be used."""
@@ -152,7 +142,7 @@ class ZenohHub:
         except (ValueError, OSError) as error:
             if not (isinstance(error, OSError) and error.errno == errno.EADDRINUSE):
                 return True  # Zenoh says what is wrong with it
-            fact = f"transport.listen: {endpoint}: {why_not(error, int(port))}"
+            fact = f"transport.listen: {endpoint}: {error.strerror} (`sudo ss -lntup` names the process)"
             if not self._settings.of_robot:
                 raise TransportError(f"{fact}; end it, or name another port") from None
             log.error("%s; the robot runs without it: end that process and start the robot again", fact)

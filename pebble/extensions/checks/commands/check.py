@@ -98,7 +98,7 @@ def _check_certificates(config: Config) -> None:
         settings = tls_settings(section.tls) if isinstance(section, Mqtt | ZenohClient) else None
         if settings is None:
             continue
-        from pebble.transports.tls import make_context  # ssl, which few configs need
+        from pebble.transports.credentials import make_context  # ssl, which few configs need
 
         try:
             make_context(settings)
