@@ -363,6 +363,7 @@ def test_a_robot_leaves_its_will_and_learns_what_the_hub_lacks_of_it(admission: 
 def test_a_person_leaves_nothing(admission: AccountAdmission, caplog: pytest.LogCaptureFixture) -> None:
     hello = admission.hello("otto", Hello("otto~1", 0, WILL, OWN))
     assert hello == Hello("otto~1", 0, None, {})
+    assert admission.refused == 1
     assert caplog.messages == [
         "refused the will of 'otto~goob-bridge': an account leaves a will for its own robot only "
         f"({GOOB}/outgoing/online)"

@@ -26,6 +26,7 @@ class Admission:
     """
 
     def __init__(self, wills: Sequence[tuple[str, bool]], unretained: Sequence[str] = ()) -> None:
+        self.refused = 0  # wills
         self._wills = tuple(reversed(wills))
         self._unretained = unretained
         self._logged: set[str] = set()
@@ -47,7 +48,7 @@ class Admission:
         return not account and bool(session)
 
     def admitted(self, record: Record) -> Record | None:
-        """Return ``record`` to be stored, without a refused will; None if it must not be stored."""
+        """Return ``record`` to be stored, without a refused will, which is counted; None if it must not be stored."""
         if isinstance(record, Retained):
             refused = any(matches(filter_, key_to_topic(record.key)) for filter_ in self._unretained)
             return None if refused else record
@@ -61,7 +62,8 @@ class Admission:
         return next((is_taken for filter_, is_taken in self._wills if matches(filter_, topic)), True)
 
     def refuse_will(self, will: Will, why: str) -> None:
-        """Log a refused will, if it is the first one of its client."""
+        """Count a refused will, and log the first refusal of its client."""
+        self.refused += 1
         self.log(will.client[:_LOGGED], "will", f"{why} ({will.topic[:_LOGGED]})")
 
     def log(self, client: str, what: str, why: str) -> None:
@@ -69,5 +71,5 @@ class Admission:
         if client in self._logged or len(self._logged) >= _CLIENTS:
             return
         self._logged.add(client)
-        more = "; those of further clients are not logged" if len(self._logged) == _CLIENTS else ""
+        more = "; those of further clients are only counted" if len(self._logged) == _CLIENTS else ""
         log.warning("refused the %s of %r: %s%s", what, client, why, more)
