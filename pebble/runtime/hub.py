@@ -1,5 +1,6 @@
 """Runs the Zenoh hub: in a robot's process pebble.launcher.announcer, or as a program on another machine."""
 
+import logging
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,6 +15,8 @@ from pebble.runtime.signals import EndSignal
 from pebble.transports.settings import ZenohSettings
 from pebble.transports.zenoh.hub import ZenohHub
 from pebble.transports.zenoh.hub.admission import Admission
+
+log = logging.getLogger(__name__)
 
 _ANY: Final = "+/+/+"  # component
 #: Where wills are allowed: not on commands and actions, which happen once, known or unknown; but on flags.
@@ -44,6 +47,8 @@ def open_hub(settings: ZenohSettings) -> Iterator[ZenohHub]:
     try:
         yield hub
     finally:
+        if hub.refused or hub.refused_wills:
+            log.info("refused in all: %d retained messages, %d wills", hub.refused, hub.refused_wills)
         hub.close()
 
 

@@ -48,6 +48,15 @@ class ZenohHub:
             self._certificates = renewed_context(settings.tls)
         self._used = self._newest  # certificates and rules of the session; before it opens, those in the files
 
+    @property
+    def refused_wills(self) -> int:
+        return self._admission.refused
+
+    @property
+    def refused(self) -> int:
+        """The number of retained messages and wills for which there was no room."""
+        return 0 if self.store is None else self.store.refused
+
     def open(self) -> ZenohHub:
         """Start the hub. Raises TransportError if the run directory has a hub already, or cannot be used."""
         self._lock = self._take_lock()
