@@ -9,6 +9,7 @@ import random
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -32,19 +33,6 @@ pytestmark = pytest.mark.computing
 ASK = encode(Frame(Type.DESCRIBE_REQ))
 
 
-class _ChangedMachine:
-    """Stands where a radio would: the modules of a boot, of which it provides ``machine``."""
-
-    def __init__(self, change: Callable[[Machine], None]) -> None:
-        self.change = change
-        self.board: Any = None
-
-    def modules(self) -> dict[str, Any]:
-        machine = Machine(self.board)
-        self.change(machine)
-        return {"machine": machine}
-
-
 class Bench:
     """``change`` gets the ``machine`` module of each boot, before the firmware does."""
 
@@ -58,9 +46,13 @@ class Bench:
     ) -> None:
         self.kind, self.turn_ms = kind, turn_ms
         self.clock = VirtualClock()
-        changed = _ChangedMachine(change)
-        self.board = Board(self.clock, changed, port=port)
-        changed.board = self.board
+
+        def modules() -> dict[str, Any]:
+            machine = Machine(self.board)
+            change(machine)
+            return {"machine": machine}
+
+        self.board: Board = Board(self.clock, SimpleNamespace(modules=modules), port=port)
         self.body: Any = body_of(kind, self.board)
         self.motors: list[tuple[float, tuple[float, float]]] = []
         self.body.on_motors = lambda now, motors: self.motors.append((now, motors))
