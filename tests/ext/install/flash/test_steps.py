@@ -23,8 +23,7 @@ from pebble.errors import PebbleError
 from pebble.extensions.install.flash.boards import FIRMWARE, Firmware
 from pebble.extensions.install.flash.private import PrivateFiles, private_files
 from pebble.extensions.install.flash.sources import firmware_folder, modules
-from pebble.extensions.install.flash.steps import FlashOptions, execute, show_steps
-from pebble.extensions.install.flash.tools import PROGRAMS, Command
+from pebble.extensions.install.flash.steps import PROGRAMS, Command, FlashOptions, execute, show_steps
 from tests.firmware.micropython import SCRIPTS, VM
 from tests.support import WAIT_S, Child
 
