@@ -62,10 +62,7 @@ class Scene(NamedTuple):
 @pytest.fixture(params=[OPERATORS[0], *map(further, OPERATORS[1:])])
 def scene(request: pytest.FixtureRequest, broker: Broker, tmp_path: Path) -> Iterator[Scene]:
     operator: Sample = request.param
-    place, words = (
-        at_open(broker),
-        {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL},
-    )
+    place, quiet = at_open(broker), {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     with switched_on(robot_in_python(tmp_path), place, tmp_path, "pebble/robots/mine/#") as (robot, seen):
         person = Child([str(word) for word in (*operator(tmp_path), *place[0])], stdin=subprocess.PIPE, **quiet)
         try:
