@@ -187,8 +187,22 @@ def test_what_a_request_is() -> None:
         assert request_of(fields) == request, fields
 
 
-def test_keys_of_several_owners_are_shorter_than_80_letters() -> None:
+def lease() -> Lease:
+    """Ann has control."""
     own = Lease(0, diff, lambda count: "a" * (2 * count), 0)
     own.hold(("", "aaaaaaaa", "ann", "phone"), 3000, False, 0)
+    return own
+
+
+def test_the_first_client_that_asks_is_published() -> None:
+    own, otto = lease(), ("", "00000001", "otto", "")
+    for client, published in ((otto, True), (otto, False), (("", "00000002", "mia", ""), False)):
+        own.changed = False
+        own.hold(client, 3000, False, 9)
+        assert (own.asker, own.changed) == (otto, published)
+
+
+def test_keys_of_several_owners_are_shorter_than_80_letters() -> None:
+    own = lease()
     for others, holds in ((0, True), (70, True), (71, False), (700, False)):
         assert own.holds(("x" * others + " " if others else "") + own.key, "") is holds
