@@ -9,9 +9,8 @@ import struct
 import subprocess
 import sys
 import threading
-import tty
 from binascii import crc_hqx
-from contextlib import closing
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +26,7 @@ from pebble.extensions.install.flash.private import check_broker, private_files
 from pebble.extensions.install.flash.verify import at_broker, on_serial_port
 from tests.commands.command_line import Run
 from tests.commands.conftest import broker as broker
+from tests.ext.install.serial_port import serial_port
 from tests.support import ROOT, WAIT_S, Broker, beside, free_port
 
 
@@ -267,46 +267,33 @@ def test_other_boards_are_refused(answer: str, problem: str) -> None:
         check_answer(answer, ESP32_C6)
 
 
-class UninterruptibleBoard:
-    """A board whose firmware ignores Ctrl-C until the board is reset."""
-
-    def __init__(self) -> None:
-        self._master, self._slave = os.openpty()
-        tty.setraw(self._slave)
-        self.port = os.ttyname(self._slave)
-        self.asked: list[str] = []
-        self._was_reset = threading.Event()
-        threading.Thread(target=self._live, daemon=True).start()
-
-    def ask(self, text: str) -> None:
-        self.asked.append(text)
-        self._was_reset.set()
-
-    def close(self) -> None:
-        os.close(self._slave)
-
-    def _live(self) -> None:
-        try:
-            while data := os.read(self._master, 64):
-                if self._was_reset.is_set() and b"\x03" in data:
-                    os.write(self._master, b"KeyboardInterrupt:\r\nMicroPython v1.29.0\r\n>>> ")
-        except OSError:
-            pass
+def answers(board: int, was_reset: threading.Event) -> None:
+    """Be a board whose firmware ignores Ctrl-C until it is reset."""
+    with suppress(OSError):
+        while data := os.read(board, 64):
+            if was_reset.is_set() and b"\x03" in data:
+                os.write(board, b"KeyboardInterrupt:\r\nMicroPython v1.29.0\r\n>>> ")
 
 
 def test_the_user_is_asked_to_reset_a_board_that_does_not_listen(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ports, "_AUTOMATIC_S", 0.3)
-    with closing(UninterruptibleBoard()) as board:
-        ports.break_in(board.port, board.ask, pulse=True, timeout_s=WAIT_S)
-    assert len(board.asked) == 1
-    assert "press its reset button" in board.asked[0]
+    asked, was_reset = list[str](), threading.Event()
+
+    def ask(text: str) -> None:
+        asked.append(text)
+        was_reset.set()
+
+    with serial_port() as (board, port):
+        threading.Thread(target=answers, args=(board, was_reset), daemon=True).start()
+        ports.break_in(port, ask, pulse=True, timeout_s=WAIT_S)
+    assert ["press its reset button" in text for text in asked] == [True]
 
 
 def test_a_board_without_micropython_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ports, "_AUTOMATIC_S", 0.1)
     unanswered = pytest.raises(DeviceError, match=r"MicroPython does not answer; .* --micropython")
-    with closing(UninterruptibleBoard()) as board, unanswered:
-        ports.break_in(board.port, lambda _: None, pulse=False, timeout_s=0.5)
+    with serial_port() as (_, port), unanswered:
+        ports.break_in(port, lambda _: None, pulse=False, timeout_s=0.5)
 
 
 def test_a_missing_port_lists_the_available_ones(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -395,16 +382,12 @@ def frame() -> bytes:
     ],
 )
 def test_a_report_on_the_line_counts_and_other_bytes_are_shown(robot: str, sent: bytes, is_report: bool) -> None:
-    master, slave = os.openpty()
-    tty.setraw(slave)
-    line = os.ttyname(slave)
-    timer = threading.Timer(0.3, os.write, (master, sent))
-    timer.start()
-    if is_report:
-        assert on_serial_port(line, FIRMWARE[robot], timeout_s=WAIT_S) == "the robot sends reports"
-    else:
-        with pytest.raises(DeviceError, match=f"no report from {robot} within 0.6 s; received b'"):
-            on_serial_port(line, FIRMWARE[robot], timeout_s=0.6)
-    timer.join()
-    os.close(master)
-    os.close(slave)
+    with serial_port() as (board, line):
+        timer = threading.Timer(0.3, os.write, (board, sent))
+        timer.start()
+        if is_report:
+            assert on_serial_port(line, FIRMWARE[robot], timeout_s=WAIT_S) == "the robot sends reports"
+        else:
+            with pytest.raises(DeviceError, match=f"no report from {robot} within 0.6 s; received b'"):
+                on_serial_port(line, FIRMWARE[robot], timeout_s=0.6)
+        timer.join()

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 import os
-import pty
 import re
 import select
 import sys
 import threading
-import tty
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,6 +20,7 @@ from pebble.extensions.install.setup.system import SetupError
 from pebble.extensions.operator.places import Places
 from pebble.services.serial_mcu_bridge.pebble_serial_v1 import frame
 from tests.commands.command_line import Run
+from tests.ext.install.serial_port import serial_port
 from tests.ext.install.setup.conftest import ANSWERS, PASSWORD, answers_in, set_up, tree
 from tests.kit.terminal import Terminal
 from tests.support import beside
@@ -150,9 +149,6 @@ _HELLO = frame.encode(frame.Frame(frame.Type.HELLO, b"x"))
 @contextmanager
 def board(folder: Path, sends: bytes) -> Iterator[int]:
     """A serial port, as a link in a folder, that sends this again and again."""
-    ours, theirs = pty.openpty()
-    tty.setraw(theirs)
-    (folder / "usb-board").symlink_to(os.ttyname(theirs))
     ending = threading.Event()
 
     def send() -> None:
@@ -160,10 +156,9 @@ def board(folder: Path, sends: bytes) -> Iterator[int]:
             if sends and select.select([], [ours], [], 0)[1]:
                 os.write(ours, sends)
 
-    with beside(send, ending):
+    with serial_port() as (ours, path), beside(send, ending):
+        (folder / "usb-board").symlink_to(path)
         yield ours
-    os.close(theirs)
-    os.close(ours)
 
 
 @pytest.mark.parametrize(
