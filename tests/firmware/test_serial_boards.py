@@ -23,7 +23,7 @@ from pebble.extensions.lab.simulation.micropython.modules.machine import Machine
 from pebble.extensions.lab.simulation.micropython.ports import SAMD21_OFFICIAL, Port
 from pebble.extensions.lab.simulation.micropython.timers import BoardReset
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import Frame, FrameError, Type, decode, encode
-from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import Manifest, parse_describe, parse_hello
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import parse_describe, parse_hello
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.struct_v1 import unpack
 from tests.ext.boards.mcu_wire import IMU
 from tests.support import some
@@ -86,12 +86,9 @@ class Bench:
         self.turn(seconds)
         return self.read(self.board.console.take_output())
 
-    def asked(self, kind: Type, payload: bytes = b"", *, interface: int = 0, sequence: int = 1) -> list[Frame]:
-        self.board.console.type(encode(Frame(kind, payload, interface=interface, sequence=sequence)))
+    def asked(self, kind: Type, *, interface: int = 0, sequence: int = 1) -> list[Frame]:
+        self.board.console.type(encode(Frame(kind, interface=interface, sequence=sequence)))
         return self.frames()
-
-    def manifest(self) -> Manifest:
-        return next(parse_describe(frame.payload) for frame in of(self.asked(Type.DESCRIBE_REQ), Type.DESCRIBE))
 
 
 def of(frames: Iterable[Frame], kind: Type) -> list[Frame]:
@@ -114,7 +111,7 @@ def test_half_a_frame_from_before_a_reset_does_not_swallow_its_hello(imu: Bench)
 
 
 def test_what_it_measures(imu: Bench) -> None:
-    fast, slow = imu.manifest().interfaces
+    fast, slow = parse_describe(MANIFEST).interfaces
     imu.body.imu.tilt_deg = (30.0, -20.0)
     frames = imu.frames(4.0)
     value = unpack(fast.fields, of(frames, Type.SAMPLE)[-1].payload)
