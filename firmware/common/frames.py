@@ -83,11 +83,11 @@ class Sender:
 
 
 class Decoder:
-    """A decoder of the host's bytes. After a byte that completes a valid frame, the attributes hold its parts."""
+    """A decoder of the host's bytes. After a byte that completes a valid frame, the attributes hold its header."""
 
     def __init__(self) -> None:
-        self.kind = self.interface = self.sequence = self.size = 0
-        self.data = bytearray(_LIMIT)  # the payload is from 13 to ``size``, until the next byte
+        self.kind = self.interface = self.sequence = 0
+        self.data = bytearray(_LIMIT)
         self._length = 0
 
     def take(self, byte: int) -> bool:
@@ -127,6 +127,5 @@ class Decoder:
             return False
         if crc16(data, size) != data[size] | data[size + 1] << 8:
             return False
-        self.size = size
         _, self.kind, _, self.interface, self.sequence, _ = struct.unpack_from(_HEADER, data, 0)
         return True

@@ -12,7 +12,7 @@ _INTERRUPT_MS = const(1000)
 def run(build, settings: dict) -> None:
     """Make the robot with ``build(settings)``, motors off, and run it. Errors of ``build`` reach the prompt."""
     robot = build(settings)
-    if getattr(robot, "ctrl_c", True):  # not where frames of the host may hold its byte: common/described.py
+    if getattr(robot, "ctrl_c", True):  # not where frames of the host may hold its byte: goob_imu/robot.py
         _allow_interrupt()
     watchdog = _watchdog()
     try:

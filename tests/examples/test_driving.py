@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,8 +12,7 @@ import pytest
 from pebble import contract as c
 from pebble.contract.payloads import Drive
 from pebble.extensions.checks.observer import Observer
-from pebble.extensions.operator.client.connection import connected
-from tests.ext.checks.conform.programs import OPERATORS, Sample, at_open, robot_in_python
+from tests.ext.checks.conform.programs import OPERATORS, Sample, at_open, robot_in_python, switched_on
 from tests.support import SOON_S, WAIT_S, Broker, Child, further, until
 
 pytestmark = pytest.mark.alone  # rates and deadlines are checked
@@ -63,35 +61,18 @@ class Scene(NamedTuple):
 
 @pytest.fixture(params=[OPERATORS[0], *map(further, OPERATORS[1:])])
 def scene(request: pytest.FixtureRequest, broker: Broker, tmp_path: Path) -> Iterator[Scene]:
-    sample: Sample = request.param
-    with _scene(sample(tmp_path), broker, tmp_path) as scene:
-        yield scene
-
-
-@contextmanager
-def _scene(operator: list[str | Path], broker: Broker, folder: Path) -> Iterator[Scene]:
-    arguments, target = at_open(broker)
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    robot = Child(
-        [str(word) for word in (*robot_in_python(folder), *arguments[:3], folder / "stop.json", *arguments[3:])],
-        **quiet,
-    )
-    try:
-        with connected(target) as (transport, names):
-            seen = Observer(target, transport, names, [f"{names.base}/#"])
-            assert seen.wait(lambda: seen.view.estop.states, WAIT_S)
-            person = Child([str(word) for word in (*operator, *arguments)], stdin=subprocess.PIPE, **quiet)
-            try:
-                scene = Scene(robot, person, seen)
-                assert until(scene.is_connected)
-                seen.look(1.0)  # until it has seen a heartbeat
-                yield scene
-            finally:
-                person.kill()
-                person.wait()
-    finally:
-        robot.kill()
-        robot.wait()
+    operator: Sample = request.param
+    place, quiet = at_open(broker), {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    with switched_on(robot_in_python(tmp_path), place, tmp_path, "pebble/robots/mine/#") as (robot, seen):
+        person = Child([str(word) for word in (*operator(tmp_path), *place[0])], stdin=subprocess.PIPE, **quiet)
+        try:
+            scene = Scene(robot, person, seen)
+            assert until(scene.is_connected)
+            seen.look(1.0)  # until it has seen a heartbeat
+            yield scene
+        finally:
+            person.kill()
+            person.wait()
 
 
 def test_it_asks_for_control_and_drives_at_its_rate(scene: Scene) -> None:

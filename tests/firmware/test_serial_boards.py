@@ -9,6 +9,7 @@ import random
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -22,7 +23,7 @@ from pebble.extensions.lab.simulation.micropython.modules.machine import Machine
 from pebble.extensions.lab.simulation.micropython.ports import SAMD21_OFFICIAL, Port
 from pebble.extensions.lab.simulation.micropython.timers import BoardReset
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import Frame, FrameError, Type, decode, encode
-from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import Manifest, parse_describe, parse_hello
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import parse_describe, parse_hello
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.struct_v1 import unpack
 from tests.ext.boards.mcu_wire import IMU
 from tests.support import some
@@ -30,19 +31,6 @@ from tests.support import some
 pytestmark = pytest.mark.computing
 
 ASK = encode(Frame(Type.DESCRIBE_REQ))
-
-
-class _ChangedMachine:
-    """Stands where a radio would: the modules of a boot, of which it provides ``machine``."""
-
-    def __init__(self, change: Callable[[Machine], None]) -> None:
-        self.change = change
-        self.board: Any = None
-
-    def modules(self) -> dict[str, Any]:
-        machine = Machine(self.board)
-        self.change(machine)
-        return {"machine": machine}
 
 
 class Bench:
@@ -58,9 +46,13 @@ class Bench:
     ) -> None:
         self.kind, self.turn_ms = kind, turn_ms
         self.clock = VirtualClock()
-        changed = _ChangedMachine(change)
-        self.board = Board(self.clock, changed, port=port)
-        changed.board = self.board
+
+        def modules() -> dict[str, Any]:
+            machine = Machine(self.board)
+            change(machine)
+            return {"machine": machine}
+
+        self.board: Board = Board(self.clock, SimpleNamespace(modules=modules), port=port)
         self.body: Any = body_of(kind, self.board)
         self.motors: list[tuple[float, tuple[float, float]]] = []
         self.body.on_motors = lambda now, motors: self.motors.append((now, motors))
@@ -94,12 +86,9 @@ class Bench:
         self.turn(seconds)
         return self.read(self.board.console.take_output())
 
-    def asked(self, kind: Type, payload: bytes = b"", *, interface: int = 0, sequence: int = 1) -> list[Frame]:
-        self.board.console.type(encode(Frame(kind, payload, interface=interface, sequence=sequence)))
+    def asked(self, kind: Type, *, interface: int = 0, sequence: int = 1) -> list[Frame]:
+        self.board.console.type(encode(Frame(kind, interface=interface, sequence=sequence)))
         return self.frames()
-
-    def manifest(self) -> Manifest:
-        return next(parse_describe(frame.payload) for frame in of(self.asked(Type.DESCRIBE_REQ), Type.DESCRIBE))
 
 
 def of(frames: Iterable[Frame], kind: Type) -> list[Frame]:
@@ -122,7 +111,7 @@ def test_half_a_frame_from_before_a_reset_does_not_swallow_its_hello(imu: Bench)
 
 
 def test_what_it_measures(imu: Bench) -> None:
-    fast, slow = imu.manifest().interfaces
+    fast, slow = parse_describe(MANIFEST).interfaces
     imu.body.imu.tilt_deg = (30.0, -20.0)
     frames = imu.frames(4.0)
     value = unpack(fast.fields, of(frames, Type.SAMPLE)[-1].payload)

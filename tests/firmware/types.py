@@ -18,9 +18,9 @@ CONFIG = Path(__file__).with_name("mypy.ini")
 OURS = Path(__file__).with_name("stubs")
 
 
-def check(firmware: Firmware, folder: Path | None = None) -> str:
+def check(firmware: Firmware) -> str:
     """mypy's complaints about one robot and all it imports, "" if there are none."""
-    folder = folder or firmware_folder().resolve()
+    folder = firmware_folder().resolve()
     stubs = STUBS / firmware.board.port
     files = sorted(path.relative_to(folder).as_posix() for path in (folder / firmware.name).glob("*.py"))
     cache = ROOT / ".mypy_cache" / firmware.board.port

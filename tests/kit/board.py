@@ -19,8 +19,9 @@ from pebble.config import Config
 from pebble.contract.serial_protocols import SERIAL_PROTOCOLS
 from pebble.extension import part
 from pebble.runtime.process import view_of
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import Frame, decode
 from tests.ext.boards import mcu_wire as wire
-from tests.ext.boards.mcu_wire import M, Received
+from tests.ext.boards.mcu_wire import M
 from tests.kit.robot import ROBOT, Listener, LocalNetwork, Running
 from tests.support import WAIT_S, until
 
@@ -37,13 +38,13 @@ class ScriptedMcu:
 
     def __init__(self, link: Path, manifest: M, *, sends_hello: bool = False) -> None:
         self.link, self.manifest, self.sends_hello = link, manifest, sends_hello
-        self.answers: Callable[[Received], bytes] = lambda received: wire.frame(
+        self.answers: Callable[[Frame], bytes] = lambda received: wire.frame(
             wire.ACK, b"", received.interface, received.sequence
         )
         self.after_describing = b""
         self.half = b""  # the partial frame of an earlier host in its buffer when it is plugged in
         self.silent = False
-        self.received: list[tuple[float, Received]] = []
+        self.received: list[tuple[float, Frame]] = []
         self.plugged_at = 0.0
         self.samples_sent = 0  # numbered samples since it was plugged in
         self._stream: tuple[float, bytes, int] | None = None
@@ -92,8 +93,8 @@ class ScriptedMcu:
         with self._lock:
             self._stream, self._next = (1 / hertz, payload, kind), time.monotonic()
 
-    def commands(self) -> list[Received]:
-        return [received for _, received in list(self.received) if received.kind == wire.CMD]
+    def commands(self) -> list[Frame]:
+        return [received for _, received in list(self.received) if received.type == wire.CMD]
 
     def obeyed(self, count: int = 1) -> list[tuple[int, bytes]]:
         """Wait for ``count`` commands; return the interface and the payload of each."""
@@ -101,7 +102,7 @@ class ScriptedMcu:
         return [(command.interface, command.payload) for command in self.commands()]
 
     def asked(self) -> int:
-        return sum(received.kind == wire.DESCRIBE_REQ for _, received in list(self.received))
+        return sum(received.type == wire.DESCRIBE_REQ for _, received in list(self.received))
 
     def close(self) -> None:
         self._ending = True
@@ -139,7 +140,7 @@ class ScriptedMcu:
             *frames, self.rest = (self.rest + os.read(self._master, 65536)).split(b"\0")
             for stuffed in frames:
                 if stuffed not in (b"", self.half):
-                    self._receive(wire.received(stuffed))
+                    self._receive(decode(stuffed))
         if self._host and self._stream is not None and not self.silent:
             period_s, payload, kind = self._stream
             while time.monotonic() >= self._next:
@@ -147,15 +148,15 @@ class ScriptedMcu:
                 self.samples_sent += 1
                 self._write(wire.frame(kind, payload, 1, self.samples_sent, self.samples_sent * 10))
 
-    def _receive(self, received: Received) -> None:
+    def _receive(self, received: Frame) -> None:
         self.received.append((time.monotonic(), received))
         if self.silent:
             return
-        if received.kind == wire.DESCRIBE_REQ:
+        if received.type == wire.DESCRIBE_REQ:
             self._write(wire.frame(wire.DESCRIBE, self.manifest.describe()) + self.after_describing)
-        elif received.kind == wire.PING:
+        elif received.type == wire.PING:
             self._write(wire.frame(wire.PONG))
-        elif received.kind == wire.CMD:
+        elif received.type == wire.CMD:
             self._write(self.answers(received))
 
     def _write(self, data: bytes) -> None:

@@ -1,4 +1,4 @@
-"""The MCU's side of pebble_serial_v1, written from the protocol's description, independently of the host's code."""
+"""What an MCU sends by pebble_serial_v1, written from the protocol's description, independently of the host's code."""
 
 from __future__ import annotations
 
@@ -42,17 +42,6 @@ def stuff(data: bytes) -> bytes:
     return bytes(out + bytes([len(block) + 1]) + block)
 
 
-def unstuff(data: bytes) -> bytes:
-    out, at = bytearray(), 0
-    while at < len(data):
-        code = data[at]
-        out += data[at + 1 : at + code]
-        at += code
-        if code < 255 and at < len(data):
-            out.append(0)
-    return bytes(out)
-
-
 def body(
     kind: int, payload: bytes = b"", interface: int = 0, sequence: int = 0, ms: int = 0, version: int = 1
 ) -> bytes:
@@ -65,26 +54,6 @@ def sealed(body: bytes) -> bytes:
 
 def frame(kind: int, payload: bytes = b"", interface: int = 0, sequence: int = 0, ms: int = 0) -> bytes:
     return sealed(body(kind, payload, interface, sequence, ms))
-
-
-@dataclass(frozen=True)
-class Received:
-    """A frame of the host, as an MCU decodes it."""
-
-    kind: int
-    interface: int
-    sequence: int
-    ms: int
-    payload: bytes
-
-
-def received(stuffed: bytes) -> Received:
-    whole = unstuff(stuffed)
-    data, (checksum,) = whole[:-2], struct.unpack("<H", whole[-2:])
-    assert checksum == crc16(data)
-    version, kind, flags, interface, sequence, ms = struct.unpack_from("<BBBHII", data)
-    assert (version, flags) == (1, 0)
-    return Received(kind, interface, sequence, ms, data[13:])
 
 
 def text(value: str | bytes) -> bytes:

@@ -115,7 +115,7 @@ def test_a_command_reaches_the_mcu_and_a_retained_one_is_refused(rig: SerialRig)
     rig.world.command("lights/lamp", {"value": {"level": 40, "on": True}})
     assert mcu.obeyed(2) == [(1, b"\x50\x01")] * 2
     for command in mcu.commands():
-        assert command.ms == pytest.approx(time.time() * 1000 % 2**32, abs=5000)
+        assert command.timestamp == pytest.approx(time.time() * 1000 % 2**32, abs=5000)
 
 
 def test_what_does_not_fit_never_reaches_the_mcu(memory_rig: SerialRig, caplog: pytest.LogCaptureFixture) -> None:

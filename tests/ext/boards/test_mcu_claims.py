@@ -30,7 +30,7 @@ from pebble.services.serial_mcu_bridge.pebble_serial_v1 import frame, manifest
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import parse_describe
 from pebble.transports import Message, QoS
 from tests.ext.boards import mcu_wire as wire
-from tests.ext.boards.mcu_wire import IMU, LAMP, STATION, F, I, M, Received
+from tests.ext.boards.mcu_wire import IMU, LAMP, STATION, F, I, M
 from tests.kit.board import SerialRig, motion
 from tests.kit.robot import BASE, ROBOT
 from tests.support import ROOT, cases, until
@@ -374,7 +374,7 @@ def test_a_contested_state_is_not_retained_and_a_contested_command_moves_nothing
     assert (one.commands(), [command.payload for command in two.commands()]) == ([], [b"\2\1"])
     second.stop()
 
-    def obeys() -> list[Received]:
+    def obeys() -> list[frame.Frame]:
         """That the alias is in use again is not announced."""
         rig.world.command("lights/lamp", {"level": 40, "on": True})
         return one.commands()

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from pebble.errors import PayloadError
+from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import Frame, decode
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.host import (
     ANSWER_S,
     SILENCE_S,
@@ -26,7 +27,7 @@ from pebble.services.serial_mcu_bridge.pebble_serial_v1.host import (
 )
 from pebble.services.serial_mcu_bridge.text.device_log import DeviceLogLine
 from tests.ext.boards import mcu_wire as wire
-from tests.ext.boards.mcu_wire import IMU, STATION, M, Received
+from tests.ext.boards.mcu_wire import IMU, STATION, M
 from tests.support import cases
 
 OPENED = 100.0
@@ -40,7 +41,7 @@ class Host:
         self.session = Session()
         self.now = OPENED
         self.events: list[Event] = []
-        self.sent: list[tuple[float, Received]] = []
+        self.sent: list[tuple[float, Frame]] = []
         self.session.opened(OPENED)
 
     def feed(self, *frames: bytes) -> list[Event]:
@@ -61,9 +62,9 @@ class Host:
         return [event for event in self.events if isinstance(event, kind)]
 
     def asked(self) -> list[float]:
-        return [round(at - OPENED, 3) for at, frame in self.sent if frame.kind == wire.DESCRIBE_REQ]
+        return [round(at - OPENED, 3) for at, frame in self.sent if frame.type == wire.DESCRIBE_REQ]
 
-    def command(self, name: str, values: dict[str, Any]) -> Received:
+    def command(self, name: str, values: dict[str, Any]) -> Frame:
         manifest = self.session.manifest
         assert manifest is not None
         interface = next(one for one in manifest.interfaces if one.name == name)
@@ -77,7 +78,7 @@ class Host:
             if isinstance(event, Send):
                 assert event.data.endswith(b"\0")
                 (stuffed,) = filter(None, event.data.split(b"\0"))
-                self.sent.append((self.now, wire.received(stuffed)))
+                self.sent.append((self.now, decode(stuffed)))
         return events
 
     def refused(self, *frames: bytes) -> str:
@@ -213,8 +214,8 @@ def test_a_frame_without_end_and_half_a_frame_from_before_the_replug_are_discard
 def test_a_command_becomes_a_frame_and_answers_find_their_command(host: Host) -> None:
     host.describe()
     first = host.command("o2_set", {"on": True})
-    assert (first.kind, first.interface, first.payload) == (wire.CMD, 3, b"\1")
-    assert first.ms == WALL_MS % 2**32
+    assert (first.type, first.interface, first.payload) == (wire.CMD, 3, b"\1")
+    assert first.timestamp == WALL_MS % 2**32
     second = host.command("o1_set", {"on": False})
     assert second.sequence == first.sequence + 1
     with pytest.raises(PayloadError, match="o1_set: on is missing"):
@@ -262,7 +263,7 @@ def test_a_silent_device_is_pinged_and_then_counts_as_gone(host: Host) -> None:
     host.describe()
     began = host.now
     host.until(began + 14.9)
-    pings = [at - began for at, frame in host.sent if frame.kind == wire.PING]
+    pings = [at - began for at, frame in host.sent if frame.type == wire.PING]
     assert pings == pytest.approx([5.0, 10.0])
     assert host.of(Gone) == []
     host.until(began + SILENCE_S)

@@ -8,9 +8,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import cv2
-import numpy as np
-
 from pebble.config import load
 from pebble.extensions.fleet import applying, certificates
 from pebble.extensions.fleet.broker_files import conf_text
@@ -51,13 +48,8 @@ CONFIG = {
 def installed(root: Path) -> Iterator[Places]:
     """It is there for the block: the page's database is open meanwhile, with changes in its journal."""
     places = Places(root)
-    for folder in (
-        places.etc,
-        places.state / "recordings",
-        root / BROKER,
-        places.broker.parent,
-        (root / PEOPLE).parent,
-    ):
+    state = (places.state / "recordings", (root / PEOPLE).parent)
+    for folder in (places.etc, *state, root / BROKER, places.broker.parent):
         folder.mkdir(parents=True)
     _write(places.etc / "mqtt.password", f"{ROBOT}\n")
     _write(places.config, json.dumps(CONFIG))
@@ -67,7 +59,8 @@ def installed(root: Path) -> Iterator[Places]:
     fleet = fleet.with_account("goob", Account(roles=("robot",), bases=("pebble/robots/goob",)))
     applying.make(root / BROKER, fleet, {"goob": ROBOT})
     _write(places.broker, conf_text(load_fleet(root / BROKER), Path("/", BROKER), "mosquitto"))
-    _calibrations(places.etc)
+    _write(places.etc / "camera_calibration.yaml", "%YAML:1.0\n---\nimage_width: 640\n")
+    _write(places.etc / "auto_tune_state.json", json.dumps({"current_values": {"left_mm_per_event": 19.1}}))
     latch = Latch("boot", 8, int.__sub__)
     latch.stop(STOP, "ann", "a dog", 1)
     stop = StateFile(config_of(places).state_file("estop-serial"))
@@ -88,13 +81,3 @@ def config_of(places: Places):  # type: ignore[no-untyped-def]
 def _write(file: Path, text: str) -> None:
     file.write_text(text)
     file.chmod(0o640)
-
-
-def _calibrations(folder: Path) -> None:
-    file = cv2.FileStorage(str(folder / "camera_calibration.yaml"), cv2.FILE_STORAGE_WRITE)
-    file.write("camera_matrix", np.array([[618.9, 0, 320], [0, 618.9, 240], [0, 0, 1.0]]))
-    file.write("distortion_coefficients", np.zeros(5))
-    file.write("image_width", 640)
-    file.write("image_height", 480)
-    file.release()
-    _write(folder / "auto_tune_state.json", json.dumps({"current_values": {"left_mm_per_event": 19.1}}))

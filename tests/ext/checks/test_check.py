@@ -48,10 +48,6 @@ def test_check_reads_the_certificates(run: Run, tmp_path: Path) -> None:
     assert f"remote_mqtt.tls.ca_cert: {tmp_path / 'ca.pem'} cannot be used: " in run.err
 
 
-def test_of_many_names_three_are_shown() -> None:
-    assert [some_of("abc"), some_of("abcd")] == ["a, b, c", "a, b, c, and 1 more"]
-
-
 def test_it_needs_a_config(run: Run) -> None:
     assert run("check") == 2
     assert "name a config" in run.err

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import random
 import sys
 from itertools import pairwise
@@ -29,9 +28,9 @@ from pebble.extensions.media.sound import (
 from pebble.extensions.media.sound_file import SoundFile
 from pebble.extensions.media.speech import Speech
 from tests.kit.sound import envelope
-from tests.vectors import make_pbat
+from tests.vectors import vectors
 
-VECTORS: list[dict[str, Any]] = json.loads(make_pbat.FILE.read_text())
+VECTORS: list[dict[str, Any]] = vectors("pbat.json")
 SECONDS = 4
 
 

@@ -25,9 +25,9 @@ from pebble.extensions.media.packets import Picture, PictureKind
 from pebble.extensions.media.scene import Scene
 from pebble.extensions.media.video import VideoEncoder, make_encoder
 from tests.support import cases
-from tests.vectors import make_video
+from tests.vectors import vectors
 
-T0 = 1_710_969_600_000
+T0, STEP_MS = 1_710_969_600_000, 66
 
 
 def small(number: int, width: int = 64, height: int = 48) -> np.ndarray:
@@ -38,7 +38,7 @@ def small(number: int, width: int = 64, height: int = 48) -> np.ndarray:
 
 def stream(name: str, count: int = 12, interval: int = 6, start_ms: int = T0, first: int = 0) -> list[bytes]:
     encoder = make_encoder(name, fps=15, keyframe_interval=interval)
-    return [encoder.encode(small(first + n), start_ms + n * 66) for n in range(count)]
+    return [encoder.encode(small(first + n), start_ms + n * STEP_MS) for n in range(count)]
 
 
 def frames(decoder: VideoDecoder, packets: list[bytes]) -> list[int | None]:
@@ -323,7 +323,7 @@ def test_without_pyav_the_error_names_what_to_install(monkeypatch: pytest.Monkey
 # -- the reference implementation
 
 
-VECTORS: dict[str, list[dict[str, Any]]] = json.loads(make_video.FILE.read_text())
+VECTORS: dict[str, list[dict[str, Any]]] = vectors("video.json")
 
 
 @pytest.mark.parametrize("name", VECTORS)
@@ -344,9 +344,9 @@ def test_the_reference_implementation_reads_our_json_and_pbvd(keyframe_interval:
         decoder = VideoDecoder()
         reference = np.zeros(0)
         for number in range(10):
-            packet = encoder.encode(make_video.camera(number), make_video.FIRST_MS + number * make_video.STEP_MS)
+            packet = encoder.encode(small(number), T0 + number * STEP_MS)
             frame, keyframe, jpeg = unpack(packet)
-            pixels = make_video.pixels(jpeg)
+            pixels = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR).astype(int)
             reference = pixels if keyframe else np.clip(reference + pixels - 128, 0, 255)
             ours = decoder.feed(packet)
             assert ours is not None
@@ -357,14 +357,14 @@ def test_the_reference_implementation_reads_our_json_and_pbvd(keyframe_interval:
 def _paper_json(packet: bytes) -> tuple[int, bool, bytes]:
     message = json.loads(packet)
     assert set(message) == {"id", "keyframe", "data", "timestamp"}
-    assert message["timestamp"] == (make_video.FIRST_MS + message["id"] * make_video.STEP_MS) / 1000
+    assert message["timestamp"] == (T0 + message["id"] * STEP_MS) / 1000
     return message["id"], message["keyframe"], zlib.decompress(base64.b64decode(message["data"], validate=True))
 
 
 def _paper_pbvd(packet: bytes) -> tuple[int, bool, bytes]:
     frame = int.from_bytes(packet[7:11], "big")
     assert packet[:7] in (b"PBVD\x01\x01\x00", b"PBVD\x01\x02\x00")
-    assert int.from_bytes(packet[11:19], "big") == make_video.FIRST_MS + frame * make_video.STEP_MS
+    assert int.from_bytes(packet[11:19], "big") == T0 + frame * STEP_MS
     assert cv2.imdecode(np.frombuffer(packet[19:], np.uint8), cv2.IMREAD_COLOR) is not None
     return frame, packet[5] == 1, packet[19:]
 

@@ -9,7 +9,6 @@ import gc
 import json
 
 import board  # puts the hardware's modules in place
-import micropython
 
 with open("/case.json") as _file:
     case = json.load(_file)
@@ -27,7 +26,6 @@ def turn():
     start = gc.mem_alloc()
     if not stage:
         baseline = start
-        micropython.qstr_info()
         stage = "starting"
     if stage == "starting":
         if waiting:
@@ -59,7 +57,6 @@ def turn():
 
 def report():
     workload.check(robot)
-    micropython.qstr_info()
     names = ("baseline", "imported", "built", "starting", "live", "peak", "peak_at", "turns")
     print(json.dumps({name: globals()[name] for name in names}))
     return False

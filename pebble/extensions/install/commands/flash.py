@@ -15,7 +15,6 @@ from pebble.extensions.install.flash import ports
 from pebble.extensions.install.flash.boards import FIRMWARE, Firmware, firmware_named
 from pebble.extensions.install.flash.private import PrivateFiles, check_broker, private_files
 from pebble.extensions.install.flash.steps import FlashOptions, execute, show_steps
-from pebble.extensions.install.flash.tools import Tools
 from pebble.runtime.environment import withhold
 
 WIFI_PASSWORD = "PEBBLE_WIFI_PASSWORD"  # noqa: S105 - the name of an environment variable
@@ -76,9 +75,9 @@ def flash(
     password_variables = () if config is None else config.password_variables
     withhold((WIFI_PASSWORD, *password_variables))  # from the programs that are started below
     if dry_run:
-        show_steps(options, Tools(), typer.echo)
+        show_steps(options, typer.echo)
         return 0
-    execute(options, Tools(), typer.echo)
+    execute(options, typer.echo)
     typer.echo(f"{robot}: done")
     return 0
 

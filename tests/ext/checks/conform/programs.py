@@ -13,13 +13,15 @@ from typing import NamedTuple
 
 import pytest
 
+from pebble.contract import ONLINE
+from pebble.extensions.checks.observer import Observer
 from pebble.extensions.fleet import certificates
 from pebble.extensions.fleet.certificates import CA_CERT
 from pebble.extensions.fleet.roles import Account
-from pebble.extensions.operator.client.connection import Target
+from pebble.extensions.operator.client.connection import Target, connected
 from tests.ext.fleet.brokers import HOST, FleetBroker
 from tests.kit.npm import package
-from tests.support import ROOT, Broker
+from tests.support import ROOT, Broker, Child
 from tests.transports.brokers import MAKERS, named_nats
 
 Command = list[str | Path]
@@ -136,12 +138,34 @@ def _certificate(folder: Path) -> tuple[Path, Path]:
     return folder / certificates.SERVER_CERT, folder / certificates.SERVER_KEY
 
 
-def at_open(broker: Broker) -> tuple[Command, Target]:
+Place = tuple[Command, Target]
+LOOKS_S = 2.0
+
+
+@contextmanager
+def switched_on(program: Command, place: Place, folder: Path, *filters: str) -> Iterator[tuple[Child, Observer]]:
+    """A robot, which saves its stop in ``folder``, and who looks at it through its broker, or at ``filters`` there."""
+    arguments, target = place
+    command = [*program, *arguments[:3], folder / "stop.json", *arguments[3:]]
+    process = Child([str(word) for word in command], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        with connected(target) as (transport, names):
+            robot = Observer(target, transport, names, filters)
+            robot.wait(lambda: robot.view.capabilities, 30)
+            robot.look(LOOKS_S)
+            robot.wait(lambda: len(robot.of(ONLINE)) > 2, LOOKS_S)  # its interval is seen by three of them
+            yield process, robot
+    finally:
+        process.kill()
+        process.wait()
+
+
+def at_open(broker: Broker) -> Place:
     """What a program is started with, and how others reach its robot."""
     return ["mine", "127.0.0.1", str(broker.port)], Target(url=f"mqtt://127.0.0.1:{broker.port}", robot="mine")
 
 
-def at_named(broker: Named, folder: Path) -> tuple[Command, Target]:
+def at_named(broker: Named, folder: Path) -> Place:
     """Return the same for accounts: ``mine`` of the robot, and ``ann`` of the other side."""
     for name in PASSWORDS:
         (folder / name).write_text(broker.passwords[name])

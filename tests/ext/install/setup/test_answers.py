@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 import os
-import pty
 import re
 import select
 import sys
 import threading
-import tty
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,6 +20,7 @@ from pebble.extensions.install.setup.system import SetupError
 from pebble.extensions.operator.places import Places
 from pebble.services.serial_mcu_bridge.pebble_serial_v1 import frame
 from tests.commands.command_line import Run
+from tests.ext.install.serial_port import serial_port
 from tests.ext.install.setup.conftest import ANSWERS, PASSWORD, answers_in, set_up, tree
 from tests.kit.terminal import Terminal
 from tests.support import beside
@@ -61,12 +60,18 @@ def test_a_missing_answer_is_named_by_its_key(
         ({"user": "Ann Lee"}, "user: 'Ann Lee' is no name"),
         ({"colour": "red"}, "colour: unknown key; there are id, port"),
         ({"password_file": "/nowhere"}, "password_file: No such file or directory"),
+        ({"id": "fred", "camera": "none"}, "id: this robot is goob"),
+        ({"port": "none"}, "broker: mosquitto is not installed: sudo apt install mosquitto, then sudo pebble setup"),
     ],
     ids=lambda value: str(value)[:24],
 )
 def test_a_wrong_answer_is_one_line_and_nothing_is_written(
     given: dict[str, Any], message: str, root: Path, tmp_path: Path, run: Run
 ) -> None:
+    if "this robot is" in message:
+        set_up(root)
+    if "not installed" in message:
+        (root / "usr/sbin/mosquitto").unlink()
     before = tree(root)
     assert run("setup", "--answers", answers_in(tmp_path, **given)) in (1, 2)
     assert message in run.err
@@ -85,21 +90,6 @@ def test_a_wrong_answer_is_one_line_and_nothing_is_written(
 def test_options_that_lead_nowhere(line: tuple[str, ...], message: str, root: Path, run: Run) -> None:
     assert run("setup", *line) in (1, 2)
     assert message in run.err
-    assert not any(Places(root).etc.iterdir())
-
-
-def test_a_robot_keeps_its_name_where_the_answers_are_of_another_one(root: Path, tmp_path: Path, run: Run) -> None:
-    set_up(root)
-    before = tree(root)
-    assert run("setup", "--answers", answers_in(tmp_path, id="fred")) == 2
-    assert "id: this robot is goob" in run.err
-    assert tree(root) == before
-
-
-def test_without_mosquitto_there_is_no_broker_here(root: Path, tmp_path: Path, run: Run) -> None:
-    (root / "usr/sbin/mosquitto").unlink()
-    assert run("setup", "--answers", answers_in(tmp_path)) == 2
-    assert run.err == "pebble: broker: mosquitto is not installed: sudo apt install mosquitto, then sudo pebble setup\n"
     assert not any(Places(root).etc.iterdir())
 
 
@@ -159,9 +149,6 @@ _HELLO = frame.encode(frame.Frame(frame.Type.HELLO, b"x"))
 @contextmanager
 def board(folder: Path, sends: bytes) -> Iterator[int]:
     """A serial port, as a link in a folder, that sends this again and again."""
-    ours, theirs = pty.openpty()
-    tty.setraw(theirs)
-    (folder / "usb-board").symlink_to(os.ttyname(theirs))
     ending = threading.Event()
 
     def send() -> None:
@@ -169,10 +156,9 @@ def board(folder: Path, sends: bytes) -> Iterator[int]:
             if sends and select.select([], [ours], [], 0)[1]:
                 os.write(ours, sends)
 
-    with beside(send, ending):
+    with serial_port() as (ours, path), beside(send, ending):
+        (folder / "usb-board").symlink_to(path)
         yield ours
-    os.close(theirs)
-    os.close(ours)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import random
 from collections.abc import Callable
 from typing import Any
@@ -20,7 +19,7 @@ from pebble.extensions.media.sound import unpack
 from tests.ext.media.test_jitter import play
 from tests.ext.page.in_node import STATIC, Rows, Script, evaluate, rows
 from tests.support import cases
-from tests.vectors import make_pbat
+from tests.vectors import vectors
 
 # -- the microphone and talks: a question of the browser is answered by ``answer()`` or ``answer(error)``
 
@@ -259,9 +258,9 @@ def test_the_same_packets_can_be_played() -> None:
     packets += [Sound(Codec.OPUS, 2, 16000, 320, 7, 1, b"\1\1" + bytes([8] * 257)).pack()]
     for channels, rate, samples in itertools.product((8, 9), (3999, 4000), (1, 4000, 4001)):
         packets += [Sound(Codec.PCM16LE, channels, rate, samples, 1, 1, bytes(2 * channels * samples)).pack()]
-    vectors = [bytes.fromhex(one["hex"]) for one in json.loads(make_pbat.FILE.read_text())]
-    packets += vectors
-    for packet in [packet for packet in packets[::100] + vectors if len(packet) < 50]:
+    known = [bytes.fromhex(one["hex"]) for one in vectors("pbat.json")]
+    packets += known
+    for packet in [packet for packet in packets[::100] + known if len(packet) < 50]:
         packets += [packet[:at] + bytes([to]) + packet[at + 1 :] for at in range(30) for to in (0, 1, 2, 3, 9, 255)]
     found = evaluate({"media/sound-packet.js": "unpack"}, _UNPACK, [packet.hex() for packet in packets])
     assert found == list(map(unpacked, packets))
