@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterable
+from functools import cache
 
 from tests.support import WAIT_S, Child
 
@@ -62,3 +63,9 @@ class Stalls:
         for line in process.stdout:
             began, ended = map(float, line.split())
             self._found.append((began, ended))
+
+
+@cache
+def stalls() -> Stalls:
+    """Return the watch of this process, which ends with it."""
+    return Stalls()

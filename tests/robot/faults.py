@@ -16,6 +16,7 @@ from functools import partial
 
 from pebble.config import LAUNCHER_LOCK
 from tests.kit.mqtt_bytes import connect, publish
+from tests.kit.stalls import lost_s, stalls
 from tests.robot.operator import Driver, Operator, number_of
 from tests.robot.rig import BASE, STOP, Rig
 from tests.support import SOON_S, gone, until
@@ -34,6 +35,7 @@ class Drive:
     """One drive through a fault: ``turns_s`` is how long wheels may turn without another line."""
 
     def __init__(self, rig: Rig, operator: Operator | None = None, *, turns_s: float = _TURNS_S) -> None:
+        stalls()  # watches from now on
         self.rig, self._turns_s = rig, turns_s
         self.began = time.monotonic()
         self.back_s = self.age_s = 0.0
@@ -72,13 +74,17 @@ class Drive:
                 assert first[0] <= _FIRST_LINE_S
 
     def _longest_turn(self) -> float:
-        """Return the seconds that motors turned after a line until the next one, or until they stood still."""
+        """Return the seconds that motors turned after a line until the next one, or until they stood still.
+
+        Times in which the machine did not run its processes are left out.
+        """
         mcu = self.rig.mcu
         events = [(at, None) for at, _ in mcu.drives(self.began)]
+        stalled = [*stalls().found, *mcu.late(self.began)]
         longest, turning, line = 0.0, False, self.began
         for at, turns in sorted([*events, *((at, wheels != STOP) for at, wheels in mcu.motors(self.began))], key=_at):
             if turning:
-                longest = max(longest, at - line)
+                longest = max(longest, at - line - lost_s(stalled, line, at))
             if turns is None:
                 line = at
             else:
