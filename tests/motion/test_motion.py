@@ -12,7 +12,7 @@ from pebble.extensions.install.flash.boards import FIRMWARE
 from pebble.motion.latch import is_name, reset_of, stop_of
 from tests.firmware.micropython import SCRIPTS, compile_module, run
 from tests.motion.histories import ENGINE, LENGTH
-from tests.motion.world import CORE_NAMES, CORES, World
+from tests.motion.world import CORE_NAMES, CORES
 from tests.support import cases
 
 HISTORIES, REPEATED = cases(80_000, 300_000) // LENGTH, 100
@@ -37,7 +37,7 @@ def traces(seed: int, count: int) -> Iterator[str]:
     """One line for each history: calls as ``[object, method, arguments, result]``."""
     for number in range(count):
         calls: list[Any] = []
-        assert ENGINE.violation((World, _recording(calls)), ENGINE.draw("", seed, number)) == ""
+        assert ENGINE.result(_recording(calls), ENGINE.draw(seed, number)).problems == []
         yield json.dumps(calls, separators=(",", ":"))
 
 

@@ -22,7 +22,7 @@ from pebble.contract import ESTOP, ESTOP_STATE, codec
 from pebble.contract.payloads import EstopState
 from pebble.extensions.operator.client.estop import StopSender, new_name
 from pebble.transports import Message
-from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps
+from tests.kit.schedules import Engine, Result, Steps
 from tests.kit.stalls import Stalls, lost_s
 from tests.robot.operator import Operator, ReceivedMessage
 from tests.robot.rig import BASE, Rig, descendants, restore, saved_by
@@ -157,7 +157,7 @@ class World:
     def close(self) -> None:
         self._opened.close()
 
-    def perform(self, schedule: Steps) -> Outcome:
+    def perform(self, schedule: Steps) -> Result:
         self.history = History()
         self.alive.overlaps.clear()
         self._looked, self._older = None, {}
@@ -183,7 +183,8 @@ class World:
             "stalled ms": round(1000 * lost_s(stalls, began, ended)),
             "allowed": len(seen.problems()) - len(found),
         }
-        return Outcome([*found, *self._out_of_turn(began), *left], counts, log=lambda: self._log(began))
+        problems = [*found, *self._out_of_turn(began), *left]
+        return Result(problems, counts, self._log(began) if problems else "")
 
     # -- what people do; what is short or long with the number ``b``
 
@@ -498,7 +499,9 @@ def _state(seen: ReceivedMessage) -> EstopState:
 
 _BEGIN = (("start", 0, None), ("take", 0, None), ("drive", 0, None))
 ENGINE = Engine(
-    draw=RandomSteps(_WEIGHTS, length=24, layouts=1, begin=_BEGIN),
+    mixes=(_WEIGHTS,),
+    length=24,
+    begin=_BEGIN,
     world=lambda kind: closing(World(kind)),
     perform=lambda world, schedule: world.perform(schedule),
     kinds=("zenoh", "mqtt", "single"),

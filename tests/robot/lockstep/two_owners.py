@@ -30,7 +30,7 @@ from pebble.config import Config, load
 from pebble.contract import CONTROL_STATE, CONTROL_TURN, CONTROL_VOUCHED, ESTOP_STATE, codec
 from pebble.runtime.process import view_of
 from pebble.transports import Message, QoS
-from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps, perform_steps
+from tests.kit.schedules import Engine, Steps
 from tests.robot.lockstep.drivers import BASE, SCRIPT, STRANGER, Commands, Driver, Holders
 from tests.robot.lockstep.network import Network, Process, Scheduler
 from tests.robot.lockstep.owner import Bridge, Disk, Outside, Owner, Wheels
@@ -397,20 +397,10 @@ _HANDOVERS = {
     "wait": 30, "take": 10, "hold": 4, "let_go": 8, "steer": 16, "stranger": 8, "old_key": 4, "freeze": 4, "kill": 3,
     "delay": 4, "repeat": 3,
 }  # fmt: skip
-
-
 _STOPPED = {
     "wait": 34, "stop": 10, "stop_again": 8, "nameless": 4, "many": 1, "reset": 12, "kill": 6, "freeze": 8, "lag": 2,
     "bridge": 1, "lose_stops": 1, "withdraw": 1, "delay": 2, "repeat": 1,
 }  # fmt: skip
-
-
-STEPS = RandomSteps(
-    *(_ALL, _HANDOVERS, _FLOODED, _STOPPED),
-    length=36,
-    layouts=18,
-    begin=[("take", 0, None), ("steer", 0, None), ("wait", 0, None)],
-)
 
 
 @contextmanager
@@ -422,16 +412,19 @@ def configs(*, groups: bool = False) -> Iterator[tuple[Config, ...]]:
         )
 
 
-def _perform(configs: tuple[Config, ...], schedule: Steps) -> Outcome:
+def _perform(configs: tuple[Config, ...], schedule: Steps) -> None:
     layout, steps = schedule
     world = TwoOwners(layout, configs)
-    perform_steps(world, steps)
+    for action, a, b in steps:
+        getattr(world, "do_" + action)(a, b)
     world.rest()
-    return Outcome()
 
 
 ENGINE = Engine(
-    draw=STEPS,
+    mixes=(_ALL, _HANDOVERS, _FLOODED, _STOPPED),
+    length=36,
+    layouts=18,
+    begin=[("take", 0, None), ("steer", 0, None), ("wait", 0, None)],
     world=lambda kind: configs(groups=kind == "groups"),  # what schedules share
     perform=_perform,
     kinds=("owners", "groups"),
