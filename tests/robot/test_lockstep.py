@@ -18,15 +18,9 @@ from tests.support import cases
 pytestmark = [pytest.mark.computing, pytest.mark.usefixtures("quiet")]
 
 
-@pytest.mark.parametrize(
-    ("kind", "seed", "number"),
-    [("owners", 1, cases(60, 200)), ("groups", 2, cases(20, 150))],
-)
-def test_no_schedule_violates_a_rule(kind: str, seed: int, number: int) -> None:
-    violated = [rule for result in ENGINE.run(kind, seed, range(number)) for rule in result.problems]
-    assert not violated, (
-        f"python -m tests.kit.schedules services --kind {kind} --seed {seed} prints the shortest schedule"
-    )
+def test_no_schedule_violates_a_rule() -> None:
+    violated = [rule for result in ENGINE.run("", 1, range(cases(80, 300))) for rule in result.problems]
+    assert not violated, "python -m tests.kit.schedules services --seed 1 prints the shortest schedule"
 
 
 # -- histories of two owners

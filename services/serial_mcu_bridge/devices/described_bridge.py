@@ -25,7 +25,6 @@ from pebble.services.serial_mcu_bridge.devices.alias_use import AliasUse
 from pebble.services.serial_mcu_bridge.devices.aliases import claims, outlet_feature
 from pebble.services.serial_mcu_bridge.devices.device import Alias, Device, Route
 from pebble.services.serial_mcu_bridge.devices.peers import PeerDevices
-from pebble.services.serial_mcu_bridge.imu.driving import follow_driving
 from pebble.services.serial_mcu_bridge.imu.reports import FAMILY, MOTION, ImuReports, ImuWatchdog, measured
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import END
@@ -224,7 +223,7 @@ class DescribedBridge(SerialService):
         self._peers.forget(device.uid)
         for subscription in self._generic:
             subscription.close()
-        self._generic = [follow_driving(self)] if device.has_motion else []
+        self._generic = [self.follow_driving()] if device.has_motion else []
         self._listen_generic(device, private=False)  # first: a reader of the manifest may send some at once
         self.publish(MCU_LOCAL_ONLY, device.local_only, uid=device.uid)
         self.publish(MCU_DESCRIBE, device.payload, uid=device.uid)

@@ -22,8 +22,6 @@ from pebble.contract import (
     ESTOP,
     ESTOP_RESET,
     ESTOP_STATE,
-    GROUP,
-    LIGHTS_SOLID,
     codec,
 )
 from pebble.contract.payloads import ControlTurn, ControlVouched
@@ -42,7 +40,6 @@ class Commands:
     def __init__(self) -> None:
         self._numbers = count()
         self._senders: dict[tuple[int, int], str] = {}
-        self.grouped: set[tuple[int, int]] = set()  # those that were sent with lights
 
     def add(self, sender: str) -> tuple[float, float]:
         """Return ``x`` and ``z`` of a new command."""
@@ -58,8 +55,7 @@ class Commands:
 class Driver(Process):
     """A page of a person, or a program that knows nothing of control."""
 
-    def __init__(self, name: str, network: Network, commands: Commands, *, groups: bool = False) -> None:
-        """``groups``: most commands are sent in a group with lights, whose colours are the speeds of the wheels."""
+    def __init__(self, name: str, network: Network, commands: Commands) -> None:
         super().__init__(name, network.scheduler)
         self.alive = True
         self.id = (name.encode().hex() * 8)[:8]
@@ -68,7 +64,7 @@ class Driver(Process):
         self.old_stops: list[dict[str, str]] = []
         self._stop_numbers = count(int.from_bytes(name.encode()) << 16)
         self._stops: dict[str, Any] = {}
-        self._commands, self._groups = commands, count() if groups else None
+        self._commands = commands
         self._wants = self._gesture = 0
         self.let_go_at = self.took_at = -1e9
         self._connection = Connection(self, network).open(0.0)
@@ -109,7 +105,7 @@ class Driver(Process):
         key = self.key if key is None else key
         sender = SCRIPT if "run" in fields else self.name if key else STRANGER
         x, z = self._commands.add(sender)
-        self._publish_drive({"x": x, "z": z} | ({"key": key} if key else {}) | fields)
+        self._publish(DRIVE.topic(BASE), {"x": x, "z": z} | ({"key": key} if key else {}) | fields)
 
     def steer(self, seconds: float, key: str | None = None, **fields: Any) -> None:
         """Drive for so long."""
@@ -123,16 +119,7 @@ class Driver(Process):
             self.scheduler.after(PERIOD_S, lambda: self._steer(gesture, until, key, fields))
 
     def zero(self, *, final: bool = False) -> None:
-        self._publish_drive({"x": 0, "z": 0} | ({"valid_ms": 0} if final else {}))
-
-    def _publish_drive(self, fields: dict[str, Any]) -> None:
-        if self._groups is None or next(self._groups) % 3 == 0:
-            self._publish(DRIVE.topic(BASE), fields)
-            return
-        x, z = fields["x"], fields["z"]
-        self._commands.grouped.add((round(1000 * (z + x)), round(1000 * (z - x))))
-        lights = {"b": 1, "g": z + x, "r": z - x}
-        self._publish(GROUP.topic(BASE), {DRIVE.metric: fields, LIGHTS_SOLID.metric: lights})
+        self._publish(DRIVE.topic(BASE), {"x": 0, "z": 0} | ({"valid_ms": 0} if final else {}))
 
     def stop(self, *, named: bool = True) -> None:
         """Stop once, with a name of its own or without one."""

@@ -43,13 +43,10 @@ class Wheels:
         self._scheduler = scheduler
         self._line = _STOP
         self._at = scheduler.now
-        self.lights = b""  # that came with the newest drive line
-        self.alone = 0  # lines of lights without one
         self.deadline = 0.0  # of the newest drive command that the line was given
 
     def receive(self, line: bytes) -> None:
-        drive, end, self.lights = line.partition(b"\n")
-        self._line, self._at = drive + end, self._scheduler.now
+        self._line, self._at = line, self._scheduler.now
 
     @property
     def speeds(self) -> tuple[int, int] | None:
@@ -80,18 +77,14 @@ class RecordedLine:
     def close(self) -> None:
         self._wheels.receive(_STOP)
 
-    def drive(self, line: bytes, valid_s: float, *, replaces: str = "") -> None:
+    def drive(self, line: bytes, valid_s: float) -> None:
         self._wheels.deadline = self._scheduler.now + valid_s
-        self._outbox.drive(line, self._scheduler.now, valid_s, replaces)
+        self._outbox.drive(line, self._scheduler.now, valid_s)
         self._pump()
 
     def halt(self) -> None:
         self._outbox.halt()
         self._pump()
-
-    def send(self, kind: str, line: bytes) -> None:
-        """Lights turn no wheel."""
-        self._wheels.alone += 1
 
     def _become_ready(self) -> None:
         """Unless the process has ended meanwhile."""

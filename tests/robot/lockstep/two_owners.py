@@ -7,7 +7,6 @@ Every step is possible at any time, and does nothing where it has no meaning, so
 * The second one is moved only by whom the first has named less than 1.5 s ago.
 * A script moves neither within 1.2 s after a person's command is over, that is, 2 s after it was sent.
 * In the end, when everything works, who takes control drives both.
-* Lights of a group shine with its drive command, in one write, or not at all; copies of its members have no effect.
 
 Every other layout has a bridge, persons are beyond it, and floods hold up what they send. Then, too:
 
@@ -54,17 +53,16 @@ _LAGS_S = (0.6, 0.8, 1.5, 2.5, 4.0)
 _WRITES_S = (1.2, 0.05, 0.005)  # to a disk
 
 
-def configuration(folder: Path, strangers: str, *, bridged: bool = False, groups: bool = False) -> Config:
+def configuration(folder: Path, strangers: str, *, bridged: bool = False) -> Config:
     """A robot of two motor owners, whose files are in ``folder``."""
     lines = {"enabled": True, "serial": {"port": str(folder / "tty")}}
     lines["instances"] = {FIRST: {"serial": {"port": str(folder / "tty-arm")}}}
     transport = {"kind": "mqtt", "state_dir": str(folder / "state"), "run_dir": str(folder / "run")}
     raw = {"robot": {"id": "goob"}, "transport": transport, "local_mqtt": {"host": "127.0.0.1"}}
     raw |= {"services": {"serial_mcu_bridge": lines}, "security": {"strangers": strangers}}
-    raw["services"]["mqtt_bridge"] = {"link": {"groups": groups}}  # type: ignore[index]
     if bridged:
-        heartbeat, remote = {"enabled": False}, {"host": "127.0.0.1"}
-        raw["services"]["mqtt_bridge"] |= {"enabled": True, "heartbeat": heartbeat, "remote_mqtt": remote}  # type: ignore[index]
+        bridge = {"enabled": True, "heartbeat": {"enabled": False}, "remote_mqtt": {"host": "127.0.0.1"}}
+        raw["services"] |= {"mqtt_bridge": bridge}
     path = folder / f"{strangers}-{bridged}.json"
     path.write_text(json.dumps(raw))
     return load(path)
@@ -94,8 +92,7 @@ class TwoOwners:
         self.stops = None if self.bridge is None else StopRules(self.scheduler, self.bridge, self.owners)
         away = self.network if self.bridge is None else self.outside
         networks = {"ann": away, "eve": away, STRANGER: self.network}
-        groups = config.services.mqtt_bridge.link.groups
-        self.drivers = {name: Driver(name, net, self.commands, groups=groups) for name, net in networks.items()}
+        self.drivers = {name: Driver(name, net, self.commands) for name, net in networks.items()}
         self.moved: set[tuple[str, str]] = set()  # (owner, driver)
         self._person_at: dict[str, float] = {}  # by owner: when a person moved it last
         self._granted: list[tuple[float, str]] = []  # when, and to whose id; what the first tells the second
@@ -154,13 +151,6 @@ class TwoOwners:
     def _turned(self, owner: Owner) -> None:
         late = self.scheduler.now > owner.wheels.deadline + _MS
         self.scheduler.check(not late or owner.wheels.speeds is None, "a wheel turns after its command's deadline")
-        wheels = owner.wheels
-        if wheels.speeds is not None:
-            left, right = wheels.speeds
-            lights = b"L 1.000 %.3f %.3f\n" % (left / 1000, right / 1000)
-            expected = lights if wheels.speeds in self.commands.grouped else b""
-            self.scheduler.check(wheels.lights == expected, "half a group is obeyed")
-        self.scheduler.check(not wheels.alone, "the copy of a member is obeyed, too")
         self.check()
 
     def _check_again(self) -> None:
@@ -404,12 +394,10 @@ _STOPPED = {
 
 
 @contextmanager
-def configs(*, groups: bool = False) -> Iterator[tuple[Config, ...]]:
+def configs(_kind: str) -> Iterator[tuple[Config, ...]]:
     with tempfile.TemporaryDirectory(prefix="pbl") as folder:
         kinds = [(strangers, bridged) for bridged in (False, True, True) for strangers in ("free", "refuse")]
-        yield tuple(
-            configuration(Path(folder), strangers, bridged=bridged, groups=groups) for strangers, bridged in kinds
-        )
+        yield tuple(configuration(Path(folder), strangers, bridged=bridged) for strangers, bridged in kinds)
 
 
 def _perform(configs: tuple[Config, ...], schedule: Steps) -> None:
@@ -425,7 +413,6 @@ ENGINE = Engine(
     length=36,
     layouts=18,
     begin=[("take", 0, None), ("steer", 0, None), ("wait", 0, None)],
-    world=lambda kind: configs(groups=kind == "groups"),  # what schedules share
+    world=configs,  # what schedules share
     perform=_perform,
-    kinds=("owners", "groups"),
 )
