@@ -199,18 +199,17 @@ _PING_S = 0.45
 class Outside(Network):
     """The operators' broker: all that it has for the bridge waits in one queue, but for the connection of stops.
 
-    ``heard(sender, message)``: it has a message; ``comes(message)``: the bridge has it.
+    ``comes(message)``: the bridge has a message.
     """
 
     def __init__(
         self,
         scheduler: Scheduler,
-        heard: Callable[[Process, Message], None],
         sent: Callable[[Process, Message], None],
         comes: Callable[[Message], None],
     ) -> None:
         super().__init__(scheduler, lambda _process, _message: None, sent)
-        self._heard, self.comes = heard, comes
+        self.comes = comes
         self._floods: list[tuple[float, float]] = []  # until when what comes has to wait so long
         self._stalled_until = self._free_at = 0.0
 
@@ -238,10 +237,9 @@ class Outside(Network):
             return
         at = max(self.scheduler.now + _TRAVEL_S + sender.delay, self._last.get((sender, client), 0.0))
         self._last[sender, client] = at
-        self.scheduler.at(at, lambda: self._queue(delivery, client, number, sender))
+        self.scheduler.at(at, lambda: self._queue(delivery, client, number))
 
-    def _queue(self, delivery: Any, client: Remote, number: int, sender: Process) -> None:
-        self._heard(sender, delivery.message)
+    def _queue(self, delivery: Any, client: Remote, number: int) -> None:
         came = self.scheduler.now
 
         def arrive() -> None:

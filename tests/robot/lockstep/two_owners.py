@@ -8,11 +8,8 @@ Every step is possible at any time, and does nothing where it has no meaning, so
 * A script moves neither within 1.2 s after a person's command is over, that is, 2 s after it was sent.
 * In the end, when everything works, who takes control drives both.
 
-Every other layout has a bridge, persons are beyond it, and floods hold up what they send. Then, too:
-
-* Nobody loses control by silence or idleness, unless the operators' broker had nothing of theirs for so long.
-* Control ends 30 s after the last message of its holder that the first owner was sent.
-* The rules of stops: :mod:`tests.robot.lockstep.stop_rules`.
+Most layouts have a bridge, persons are beyond it, and floods hold up what they send. Then the rules of stops hold, too:
+:mod:`tests.robot.lockstep.stop_rules`.
 """
 
 from __future__ import annotations
@@ -26,11 +23,11 @@ from itertools import count
 from pathlib import Path
 
 from pebble.config import Config, load
-from pebble.contract import CONTROL_STATE, CONTROL_TURN, CONTROL_VOUCHED, ESTOP_STATE, codec
+from pebble.contract import CONTROL_STATE, CONTROL_TURN, ESTOP_STATE, codec
 from pebble.runtime.process import view_of
 from pebble.transports import Message, QoS
 from tests.kit.schedules import Engine, Steps
-from tests.robot.lockstep.drivers import BASE, SCRIPT, STRANGER, Commands, Driver, Holders
+from tests.robot.lockstep.drivers import BASE, SCRIPT, STRANGER, Commands, Driver
 from tests.robot.lockstep.network import Network, Process, Scheduler
 from tests.robot.lockstep.owner import Bridge, Disk, Outside, Owner, Wheels
 from tests.robot.lockstep.stop_rules import StopRules
@@ -76,8 +73,7 @@ class TwoOwners:
         self.scheduler = Scheduler(10_000.0)
         self.commands = Commands()
         self.network = Network(self.scheduler, self._arrived, self._published)
-        self.holders = Holders(self.scheduler, FIRST)
-        self.outside = Outside(self.scheduler, self.holders.heard, self._sent, self._comes)
+        self.outside = Outside(self.scheduler, self._sent, self._comes)
         self.bridge = Bridge(self.network, self.outside, config) if config.services.mqtt_bridge.enabled else None
         numbers = count(1)
         disk: Disk = {}
@@ -135,17 +131,11 @@ class TwoOwners:
             turn = codec.decode(CONTROL_TURN, message.payload)
             self._recorded = [*self._recorded, message][-8:]
             self._granted = [*self._granted, (self.scheduler.now, turn.id)][-100:]
-            if self.bridge is not None:
-                self.holders.granted(turn, {driver.id: driver for driver in self.drivers.values()})
         elif process is self.owners[FIRST] and message.topic == CONTROL_STATE.topic(BASE, owner=FIRST):
             self._shown = self.scheduler.now, codec.decode(CONTROL_STATE, message.payload).id
-        elif message.topic == CONTROL_VOUCHED.topic(BASE):
-            self.holders.vouched(codec.decode(CONTROL_VOUCHED, message.payload))
 
     def _arrived(self, process: Process, message: Message) -> None:
-        if process is self.owners[FIRST]:
-            self.holders.arrived(message)
-        elif self.stops is not None and process is self.bridge:
+        if self.stops is not None and process is self.bridge:
             self.stops.learns(message)
 
     def _turned(self, owner: Owner) -> None:
