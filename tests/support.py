@@ -7,7 +7,6 @@ import logging
 import os
 import signal
 import socket
-import statistics
 import subprocess
 import sys
 import threading
@@ -105,14 +104,6 @@ class Clock:
 
     def __call__(self) -> float:
         return self.now
-
-
-def quarters(values: Sequence[float]) -> list[float]:
-    """Return the medians of the quarters of a run. In the first, caches fill and the heap finds its size."""
-    size = max(1, len(values) // 4)
-    return [statistics.median(values[at * size : (at + 1) * size] or values) for at in range(3)] + [
-        statistics.median(values[-size:])
-    ]
 
 
 def gone(pid: int) -> bool:

@@ -10,7 +10,7 @@ tool() { PYTHONPATH=.venv/tools $python "$@"; }
 list() {
     cat <<END
 make long PART=stops      400 random schedules of people, stops, scripts and faults with whole robots, two hours
-make long PART=soak       floods, kills, freezes, full disks and more while an operator drives; MINUTES=30 for each transport
+make long PART=soak       floods, kills, freezes, full disks and more while an operator drives, ten minutes
 make long PART=schedules  random schedules in virtual time, an hour
 make long PART=page       every state, card, interruption and finger at the operator page in Chromium, 25 minutes
 make long PART=engines    drive and stop a robot at the page in Firefox and WebKitGTK, and a demo in Firefox, ten minutes
@@ -39,7 +39,7 @@ esac
 
 case "$1" in
 stops) $python -m tests.kit.schedules robot --log build/stops ;;
-soak) for transport in zenoh mqtt; do $python -m tests.robot.soak --minutes "${MINUTES:-5}" --transport $transport; done ;;
+soak) tests tests/robot/test_faults.py tests/robot/test_surroundings.py ;;
 schedules) # the shortest schedule that violates a rule is printed, or the seed of a sequence that does
     $python -m tests.kit.schedules motion --schedules 10000
     $python -m tests.kit.schedules services --schedules 20000 --jobs 2

@@ -1,27 +1,67 @@
 """The leases of a robot's motor owners. Of several, the first owner by name grants, and the others follow. Pure.
 
 A *turn* is a grant with its number, which the others repeat. Times are milliseconds of the machine's clock.
+No holder is taken for silent because of a flood, an outage or a stalled broker.
 """
 
 import sys
 from typing import Any
 
 from pebble.contract.payloads import ControlTurn
-from pebble.motors.vouched_lease import VouchedLease
+from pebble.motion.lease import Lease
 
+ENDS_AFTER_MS = 30_000  # so long control lasts without a message of its holder, whatever else happens
+_IDLE_MS, _OTHERS_MS = 5000, 2000  # as in Lease
 FOLLOWS_MS = 1500  # so long after it was sent a turn is followed; it is repeated every 500
 SETTLES_MS = FOLLOWS_MS + 100
 
 
-class SharedLease(VouchedLease):
-    """The lease of an only owner, and the base of two that refuse motion while owners may disagree who has control."""
+class SharedLease(Lease):
+    """The lease of an only owner, and the base of two that refuse motion while owners may disagree who has control.
 
+    Silence of the holder counts only in periods for which the bridge vouches, because it has passed on every message
+    that came in them. After ``ENDS_AFTER_MS`` it counts in any case.
+    """
+
+    vouched: tuple[int, int] | None = None  # begin and end; None: there is no bridge, and all time counts
+    _received_all_since = 0  # before it messages may have been lost in this process
     until = sys.maxsize  # when everything stops, unless another turn is received before
 
     def __init__(self, peers: frozenset[str], now: int, *lease: Any) -> None:
-        """Store the peers, which are the other motor owners; ``lease``: the other arguments of VouchedLease."""
+        """Store the peers, which are the other motor owners; ``lease``: the other arguments of Lease."""
         super().__init__(now, *lease)
         self.peers = peers
+
+    def vouch(self, begin: int, end: int, now: int) -> None:
+        """Note the period for which the bridge vouches. Ignore one from the future: it is of another clock."""
+        if self.vouched is not None and begin <= end <= now:
+            self.vouched = max(begin, self._received_all_since), end
+
+    def doubt(self, now: int) -> None:
+        """Note that messages which the bridge has forwarded until now may be lost in this process."""
+        self._received_all_since = now
+
+    def tick(self, now: int) -> None:
+        """End control whose time is over. This repeats Lease.tick, which is kept in one piece to save memory on boards.
+
+        The silent time is computed in each call, because the vouched time may shrink.
+        """
+        if self.others and now - self._received >= _OTHERS_MS:
+            self.others, self.changed = False, True
+        if self.asker and now - self._asked >= self._wait:
+            self.asker, self.changed = (), True
+        self._held = self.key != "" and self._quiet_ms(self._held_from, now) < _IDLE_MS
+        # Not renewed for too long, or another client asks and the holder is idle:
+        if self.key and (self._quiet_ms(self._since, now) >= self._limit_ms or (self.asker and not self._held)):
+            self._end(now)
+
+    def _quiet_ms(self, since: int, now: int) -> int:
+        """Return for how long the holder has been silent, counting only vouched time."""
+        quiet = now - since
+        if self.vouched is None or quiet >= ENDS_AFTER_MS:
+            return quiet
+        begin, end = self.vouched
+        return end - max(since, begin)
 
     def refuses(self, moves: bool, script: bool, key: str, by: str, now: int) -> bool:
         refused = super().refuses(moves, script, key, by, now)
@@ -109,7 +149,7 @@ class FollowingLease(SharedLease):
 
 
 def lease_of(owner: str, owners: tuple[str, ...], boot: str, *lease: Any) -> SharedLease:
-    """Return the lease of ``owner``, one of the robot's ``owners``; ``lease``: the arguments of VouchedLease."""
+    """Return the lease of ``owner``, one of the robot's ``owners``; ``lease``: the arguments of Lease."""
     others, first = frozenset(owners) - {owner}, min(owners, default=owner)
     if not others:
         return SharedLease(others, *lease)

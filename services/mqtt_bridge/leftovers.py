@@ -17,12 +17,9 @@ _EXCEPTED = (ONLINE, MCU_DESCRIBE)  # the bridge's own, and one that MCU_VALUE c
 class Leftovers:
     """The topics that robot and broker retain. Transports call :meth:`note_local` on their threads."""
 
-    def __init__(self, base: str, subjects: Subjects, remote: Transport, *channels: Channel, sparing: bool) -> None:
-        """Store the arguments; ``channels`` are more channels that the bridge itself publishes on the remote side.
-
-        ``sparing``: do not ask for topics that the robot has, because the answers would delay messages to it.
-        """
-        self._remote, self._sparing = remote, sparing
+    def __init__(self, base: str, subjects: Subjects, remote: Transport, *channels: Channel) -> None:
+        """Store the arguments; ``channels`` are more channels that the bridge itself publishes on the remote side."""
+        self._remote = remote
         self._on_robot: set[str] | None = set()  # topics that the robot retains; None: the search is over
         self._at_remote: set[str] = set()  # topics that the broker retains
         self._subscriptions: list[Subscription] = []
@@ -49,9 +46,12 @@ class Leftovers:
         self._at_remote.clear()
 
     def ask_next(self) -> bool:
-        """Ask the broker for the topics of the next filter, and wait for the answer; False if none is left."""
+        """Ask the broker for the topics of the next filter, and wait for the answer; False if none is left.
+
+        Topics that the robot has are left out: they stay, and over a thin link the answers would delay messages to it.
+        """
         on_robot = self._on_robot or set()
-        while self._sparing and self._next < len(self._filters) and self._filters[self._next] in on_robot:
+        while self._next < len(self._filters) and self._filters[self._next] in on_robot:
             self._next += 1
         if self._next == len(self._filters):
             return False

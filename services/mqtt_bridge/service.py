@@ -86,9 +86,7 @@ class MqttBridge(ForwardingService):
         self._is_thin = section.link.profile != "wide"  # or may become so
         self._uplink = uplink_of(self.config, self.addresses, self.remote, self.forwarder, self.clock)
         self._requests = OwnRequests(self, self.forwarder.mirroring, self._uplink.note_drive)
-        self._leftovers = Leftovers(
-            self.config.base, self.subjects, self.remote, *self._uplink.channels, sparing=self._is_thin
-        )
+        self._leftovers = Leftovers(self.config.base, self.subjects, self.remote, *self._uplink.channels)
         self._leftover_timer: Timer | None = None
 
         # The period of which the motor owners have all messages. Without pings only a long silence shows a loss.

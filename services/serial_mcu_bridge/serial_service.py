@@ -6,6 +6,8 @@ from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
 from pebble.config import SerialBridge
+from pebble.contract import DRIVE
+from pebble.contract.payloads import Drive
 from pebble.errors import ConfigError, DeviceError
 from pebble.runtime.notes import OFTEN
 from pebble.runtime.parent import Notifier, Reported
@@ -16,6 +18,7 @@ from pebble.services.serial_mcu_bridge.line.serial_line import LineState, Serial
 from pebble.services.serial_mcu_bridge.line.silence import CHECK_S, Silence
 from pebble.services.serial_mcu_bridge.line.starts import Starts
 from pebble.services.serial_mcu_bridge.moving_sensors import MovingSensors
+from pebble.transports import Subscription
 from pebble.transports.counters import in_words
 
 _MISREAD = "what its board sends is not understood: another baud rate or firmware, or noise"
@@ -70,6 +73,17 @@ class SerialService(Service, ABC):
     def options(self) -> SerialBridge:
         """Config section of this serial line; with instances, the merged section of this instance."""
         return self.config.services.serial_mcu_bridge
+
+    def follow_driving(self) -> Subscription:
+        """Subscribe to drive commands, for a board that does not itself move the wheels.
+
+        While they move the wheels, a sensor that never changes has failed.
+        """
+
+        def note(drive: Drive) -> None:
+            self.sensors.drive(self.clock() + self.options.safety.drive_timeout_seconds if drive.moves else 0.0)
+
+        return self.listen(DRIVE, note)
 
     # -- to override
 

@@ -122,11 +122,11 @@ class LocalNetwork:
         }
         return parse(raw, folder=folder, env={})
 
-    def robots_transport(self, config: Config, name: str, *, as_published: bool = False) -> Transport:
+    def robots_transport(self, config: Config, name: str) -> Transport:
         """Return the transport that the robot's process ``name`` would use."""
         if self.kind == "memory":
             return MemoryTransport(name, self._memory)
-        return local_transport(config, name, as_published=as_published)
+        return local_transport(config, name)
 
     def client(self, name: str) -> Transport:
         if self.kind == "memory":

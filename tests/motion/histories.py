@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import random
-from collections.abc import Iterator
+from contextlib import nullcontext
 from typing import Any
 
-from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps, shared
+from tests.kit.schedules import Engine, Steps
 from tests.motion.world import CORES, LAYOUTS, World
 
 LENGTH = 100  # steps of a history
@@ -40,30 +39,18 @@ _CONTROL = {
 }  # fmt: skip
 
 
-def _numbers(chance: random.Random, count: int) -> Iterator[tuple[int, int]]:
-    """Numbers below 8 and below 64, drawn at once, for there are many."""
-    numbers = chance.randbytes(2 * count)
-    return ((numbers[2 * at] & 7, numbers[2 * at + 1] & 63) for at in range(count))
-
-
-def _perform(what: tuple[type[World], Any], history: Steps) -> Outcome:
-    """``what``: the world and its cores."""
+def _perform(cores: Any, history: Steps) -> None:
     layout, steps = history
-    kind, cores = what
-    world = kind(layout, cores)
+    world = World(layout, cores)
     world.perform(steps)
     world.rest()
-    return Outcome()
 
 
 ENGINE = Engine(
-    draw=RandomSteps(
-        *(_EVERYTHING, _DRIVING, _CONTROL, _RESETTING, _SAVING, _CONTROL),
-        length=LENGTH,
-        layouts=len(LAYOUTS),
-        numbers=_numbers,
-    ),
-    world=lambda _kind: shared((World, CORES)),
+    mixes=(_EVERYTHING, _DRIVING, _CONTROL, _RESETTING, _SAVING, _CONTROL),
+    length=LENGTH,
+    layouts=len(LAYOUTS),
+    world=lambda _kind: nullcontext(CORES),
     perform=_perform,
     schedules=3000,
     per_world=1000,

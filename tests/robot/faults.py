@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 import itertools
+import mmap
 import os
 import secrets
 import shutil
 import signal
 import socket
+import struct
+import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 from pebble.config import LAUNCHER_LOCK
 from tests.kit.mqtt_bytes import connect, publish
 from tests.kit.stalls import lost_s, stalls
 from tests.robot.operator import Driver, Operator, number_of
-from tests.robot.rig import BASE, STOP, Rig
-from tests.support import SOON_S, gone, until
+from tests.robot.rig import BASE, STOP, Rig, restore, saved_by
+from tests.small_disk import SmallDisk
+from tests.support import SOON_S, Broker, gone, until
 from tests.transports.net import Forked
 
 AGE_S = 2.5  # no older command ever reaches the wheels
@@ -191,7 +197,7 @@ def frozen(*pids: int) -> Iterator[None]:
 class Fault:
     """A fault that lasts for some seconds. ``turns_s``: how long wheels may turn without another line."""
 
-    happens: Callable[[Rig], AbstractContextManager[object]]
+    happens: Callable[[Any], AbstractContextManager[object]]  # of a rig
     seconds: float = 0.2
     turns_s: float = _TURNS_S
 
@@ -287,3 +293,76 @@ def main(name: str, port: int, seconds: float) -> None:
         broker.recv(_CONNACK_BYTES)
         for packet in flood.removals(send(broker, flood, seconds)):
             broker.sendall(packet)
+
+
+#: Python imports it at the start of each process of the robot. Zenoh's own clock does not jump.
+_CLOCK = """\
+import mmap, os, struct, time
+
+with open(os.environ["TEST_CLOCK"], "r+b") as file:
+    ahead = mmap.mmap(file.fileno(), 8)
+clock, clock_ns = time.time, time.time_ns
+time.time_ns = lambda: clock_ns() + struct.unpack("q", ahead)[0]
+time.time = lambda: clock() + struct.unpack("q", ahead)[0] / 1e9
+"""
+
+
+class HarshRig(Rig):
+    """A robot with small disks of its own and a clock that can jump, at a broker that saves. Needs root."""
+
+    def __init__(self, kind: str) -> None:
+        self._broker_folder = tempfile.TemporaryDirectory(prefix="pbl")
+        place = Path(self._broker_folder.name)
+        (place / "clock").write_bytes(bytes(8))
+        (place / "sitecustomize.py").write_text(_CLOCK)
+        with (place / "clock").open("r+b") as clock:
+            self._ahead = mmap.mmap(clock.fileno(), 8)
+        self._environment = {"TEST_CLOCK": str(place / "clock"), "PYTHONPATH": str(place)}
+        broker = Broker(place, persistence=True, autosave=False)
+        super().__init__(kind, mcu="fred", start=False, remote=broker, listens="outgoing/#")
+        self._disks = [SmallDisk(self.folder / name, mebibytes=8) for name in ("run", "state")]
+        for disk in self._disks:
+            disk.mount("mode=700")
+
+    def start(self, ready: bool = True, **options: Any) -> float:
+        return super().start(ready, env=os.environ | self._environment, **options)
+
+    def close(self) -> None:
+        self.ensure_stopped()
+        for disk in self._disks:
+            disk.close()
+        super().close()
+        self._broker_folder.cleanup()
+
+    @contextmanager
+    def jump(self, seconds: int) -> Iterator[None]:
+        self._ahead[:] = struct.pack("q", seconds * 10**9)
+        yield
+        self._ahead[:] = bytes(8)
+
+    @contextmanager
+    def full(self) -> Iterator[None]:
+        with ExitStack() as ends:
+            for disk in self._disks:
+                ends.enter_context(disk.full())
+            yield
+
+    @contextmanager
+    def restored(self) -> Iterator[None]:
+        """Give the broker an older save."""
+        saved = saved_by(self.remote)
+        time.sleep(1)  # in which heartbeats and states change
+        self.remote.kill()
+        restore(saved)
+        yield
+        self.remote.start()
+
+
+#: Of a harsh rig.
+HARSH = {
+    "a clock a day ahead": Fault(lambda rig: rig.jump(86_400), 3.0),
+    "a clock an hour behind": Fault(lambda rig: rig.jump(-3_600), 3.0),
+    "full disks": Fault(HarshRig.full, 3.0),
+    "a broker of before": Fault(HarshRig.restored),
+    **{name: Fault(lambda rig, name=name: flooding(name, rig.remote.port, 3.0), 3.0) for name in FLOODS},  # type: ignore[misc]
+}

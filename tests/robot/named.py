@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal
 
 from pebble.extensions.fleet.roles import Account
@@ -33,16 +34,6 @@ class Hall(FleetBroker):
         return Operator(self.plain_port, BASE, listens, login=(name, self.passwords[name]), **options)
 
 
-class Remote:
-    """What a rig needs of its remote broker, which is not its own."""
-
-    def __init__(self, hall: Hall) -> None:
-        self.port, self.kill, self.start = hall.plain_port, hall.stop, hall.start
-
-    def stop(self) -> None:
-        """Others end it."""
-
-
 class Named(Rig):
     """A robot with an account. ``person`` and ``send`` are for people with accounts of their own.
 
@@ -54,7 +45,8 @@ class Named(Rig):
     ) -> None:
         self.hall, self._people = hall, dict[str, Operator]()
         options = {"direct": True, "autonomy_manager": {"enabled": True}} | options
-        remote: Any = Remote(hall)
+        # what a rig needs of its broker, which others end
+        remote: Any = SimpleNamespace(port=hall.plain_port, kill=hall.stop, start=hall.start, stop=lambda: None)
         super().__init__(kind, remote=remote, operator=hall.client("boss"), start=False, **options)
         self._people["boss"] = self.operator
         try:

@@ -152,21 +152,6 @@ def first_motion(station: Station, since: float) -> tuple[float, tuple[float, fl
     return next((at, wheels) for at, wheels in station.rig.mcu.drives(since) if wheels != STOP)
 
 
-@pytest.mark.parametrize(
-    ("body", "wheels"),
-    [
-        ({"x": 0.2, "z": 0.5}, (0.7, 0.3)),
-        ({"x": 1, "z": -1e300, "y": 0.5}, (0.0, -1.0)),
-    ],
-)
-def test_drive_forms_reach_the_wheels(station: Station, body: Any, wheels: tuple[float, float]) -> None:
-    stop_and_wait(station)
-    began = time.monotonic()
-    station.operator.send(DRIVE, body)
-    assert until(lambda: station.rig.mcu.moving(began))
-    assert first_motion(station, began)[1] == pytest.approx(wheels)
-
-
 def test_silence_stops_the_wheels(station: Station) -> None:
     watch = stalls()
     stop_and_wait(station)

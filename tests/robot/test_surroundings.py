@@ -8,14 +8,16 @@ import resource
 import signal
 import subprocess
 import time
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
 from pebble.contract import CHANNELS, ESTOP, INCOMING
+from tests.own_memory import own_mb
+from tests.robot.faults import HARSH, Drive, HarshRig
 from tests.robot.rig import STOP, Rig, descendants
-from tests.support import ROOT, cases, further, gone, some, until
+from tests.support import ROOT, cases, further, gone, needs_root, some, until
 
 pytestmark = pytest.mark.alone
 
@@ -124,7 +126,7 @@ def test_malformed_messages(kind: str) -> None:
         assert rig.processes() == processes
         assert not rig.mcu.moving(began)
         assert rig.recorded() == []
-        assert _memory(rig) - memory < 30 * 1024, "memory grew by more than 30 MB"
+        assert _memory(rig) - memory < 30
         assert until(
             lambda: any("refused" in seen.json["message"] for seen in rig.operator.on("outgoing/logs", began)), 10
         )
@@ -140,7 +142,27 @@ def _still_responds(rig: Rig, shade: float) -> bool:
     return until(lambda: any(entry.line == line for entry in rig.mcu.entries(began)))
 
 
-def _memory(rig: Rig) -> int:
-    """Resident memory of all the robot's processes, KB."""
-    pages = sum(int(Path(f"/proc/{pid}/statm").read_text().split()[1]) for pid in rig.processes().values())
-    return pages * os.sysconf("SC_PAGE_SIZE") // 1024
+def _memory(rig: Rig) -> float:
+    """Return the memory of all the robot's processes, MB."""
+    return sum(map(own_mb, rig.processes().values()))
+
+
+@pytest.fixture(scope="module", params=["mqtt", "zenoh"])
+def harsh(request: pytest.FixtureRequest) -> Iterator[tuple[HarshRig, float]]:
+    """Yield a robot on a machine that fails, and the memory that it takes at first."""
+    with HarshRig(request.param) as rig:
+        rig.start()
+        yield rig, _memory(rig)
+
+
+@needs_root
+@pytest.mark.thorough
+@pytest.mark.timeout(180)
+@pytest.mark.parametrize("name", HARSH)
+def test_a_flood_or_a_fault_of_the_machine_while_an_operator_drives(harsh: tuple[HarshRig, float], name: str) -> None:
+    rig, before = harsh
+    rig.wait_until_up(0.0)
+    drive = Drive(rig, turns_s=HARSH[name].turns_s)
+    HARSH[name].perform(rig, drive)
+    time.sleep(1.5)  # without commands
+    assert _memory(rig) - before < 30, "also after many floods"

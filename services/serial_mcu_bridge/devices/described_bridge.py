@@ -18,14 +18,13 @@ from pebble.contract import (
 )
 from pebble.contract.payloads import McuManifest, McuSample
 from pebble.errors import DeviceError, PayloadError
-from pebble.runtime.parent import Notifier
+from pebble.runtime.parent import Notifier, Reported
 from pebble.runtime.service import every, on
 from pebble.runtime.timers import Timer
 from pebble.services.serial_mcu_bridge.devices.alias_use import AliasUse
 from pebble.services.serial_mcu_bridge.devices.aliases import claims, outlet_feature
 from pebble.services.serial_mcu_bridge.devices.device import Alias, Device, Route
 from pebble.services.serial_mcu_bridge.devices.peers import PeerDevices
-from pebble.services.serial_mcu_bridge.imu.driving import follow_driving
 from pebble.services.serial_mcu_bridge.imu.reports import FAMILY, MOTION, ImuReports, ImuWatchdog, measured
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.frame import END
@@ -84,7 +83,9 @@ class DescribedBridge(SerialService):
         #: To the generic topics, mcu/…, of the device that was described last, connected or not.
         self._generic: list[Subscription] = []
         self.aliases = AliasUse(self.log, self._peers, self._begin_alias, self._end_alias, self.options.aliases)
-        self._features = _ProvidedFeatures(Notifier())  # such as outlets, for the robot's capabilities
+        self._provided: set[str] = set()  # features, such as outlets, for the robot's capabilities
+        self._notifier = Notifier()
+        self._features: dict[str, Reported] = {}  # that were provided, by name, as the launcher knows them
         self._timer: Timer | None = None  # for the next event of the session, or of the peers
 
     def start(self) -> None:
@@ -115,7 +116,8 @@ class DescribedBridge(SerialService):
 
     @every(_WATCH_S)
     def watch(self) -> None:
-        self._features.report()
+        for name, feature in self._features.items():
+            feature.report(name, name in self._provided)
         if self.watchdog.expired(self.clock()):
             raise DeviceError(f"no sample for {self.watchdog.timeout_s:g} s")
 
@@ -224,7 +226,7 @@ class DescribedBridge(SerialService):
         self._peers.forget(device.uid)
         for subscription in self._generic:
             subscription.close()
-        self._generic = [follow_driving(self)] if device.has_motion else []
+        self._generic = [self.follow_driving()] if device.has_motion else []
         self._listen_generic(device, private=False)  # first: a reader of the manifest may send some at once
         self.publish(MCU_LOCAL_ONLY, device.local_only, uid=device.uid)
         self.publish(MCU_DESCRIBE, device.payload, uid=device.uid)
@@ -309,7 +311,10 @@ class DescribedBridge(SerialService):
 
     def _begin_alias(self, device: Device, route: Route, alias: Alias) -> Subscription | None:
         """Return the subscription to an alias for commands; on any other alias publish the newest state."""
-        self._features.names |= outlet_feature(alias.claim)
+        names = outlet_feature(alias.claim)
+        self._provided |= names
+        for name in names:
+            self._features.setdefault(name, Reported(self._notifier.feature, name, False))
         if route.interface.direction is Direction.IN:
             return self.listen(alias.channel, partial(self._command, device, route))
         newest = self._published_states.get(route.interface.id)
@@ -318,7 +323,7 @@ class DescribedBridge(SerialService):
         return None
 
     def _end_alias(self, alias: Alias) -> None:
-        self._features.names -= outlet_feature(alias.claim)
+        self._provided -= outlet_feature(alias.claim)
         if alias.channel.kind is Kind.STATE:
             self.retract(alias.channel)
         elif self.addresses[alias.channel].retain:  # the config retains a stream
@@ -366,18 +371,3 @@ class DescribedBridge(SerialService):
 
 def _now_ms() -> int:
     return time.time_ns() // 1_000_000
-
-
-class _ProvidedFeatures:
-    """The features that this process provides, reported to the launcher: call :meth:`report` regularly."""
-
-    def __init__(self, notifier: Notifier) -> None:
-        self.names: set[str] = set()  # change it at will
-        self._notifier = notifier
-        self._reported: set[str] = set()
-
-    def report(self) -> None:
-        """Report changes, also those for which the launcher was too busy before."""
-        for name in sorted(self._reported ^ self.names):  # those that are in one of the two
-            if self._notifier.feature(name, name in self.names):
-                self._reported ^= {name}

@@ -8,7 +8,6 @@ from pebble.contract import IMU, IMU_FAST
 from pebble.errors import DeviceError
 from pebble.runtime.lines import LineSplitter
 from pebble.runtime.service import every
-from pebble.services.serial_mcu_bridge.imu.driving import follow_driving
 from pebble.services.serial_mcu_bridge.imu.mpu6050 import Motion, Report, Summary, parse
 from pebble.services.serial_mcu_bridge.imu.reports import ImuReports, ImuWatchdog, measured
 from pebble.services.serial_mcu_bridge.line.serial_line import LineState
@@ -31,7 +30,7 @@ class ImuBridge(SerialService):
 
     def set_up(self) -> None:
         super().set_up()
-        follow_driving(self)
+        self.follow_driving()
 
     def on_line_state(self, state: LineState) -> None:
         if state is LineState.BOOTING:

@@ -68,7 +68,6 @@ class SerialLine:
         end: bytes = b"\n",
     ) -> None:
         self.opened = 0  # how often the device was opened
-        self.refused = 0  # lines refused because there was no device
         self.received = 0  # chunks of bytes from the device since it was opened and has booted
         self._opening = _Opening(path, baud, boot_s, retry_s)
         self._on_bytes, self._on_state = on_bytes, on_state
@@ -141,7 +140,6 @@ class SerialLine:
         with self._lock:
             port, output = self._port, self.output
             if port is None or self._closing:
-                self.refused += 1
                 return False
             was_idle = not output.sending and not output.outbox.waiting
             ready = self._state is LineState.READY

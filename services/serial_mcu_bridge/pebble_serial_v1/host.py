@@ -55,10 +55,9 @@ class Send:
 
 @dataclass(frozen=True, slots=True)
 class Described:
-    """An event: the MCU's manifest is known; ``remembered``: from an earlier DESCRIBE, after the same HELLO."""
+    """An event: the MCU's manifest is known, from a DESCRIBE now or earlier."""
 
     manifest: Manifest
-    remembered: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,10 +178,6 @@ class Session:
             events.append(Answer(command.name, sequence, None))
         return events
 
-    def command(self, interface: Interface, values: Mapping[str, Any], now: float, wall_ms: int) -> Send:
-        """Return the frame that sets ``interface`` to ``values``. Raises PayloadError for values out of range."""
-        return self.commands([(interface, values)], now, wall_ms)
-
     def commands(self, wanted: Sequence[tuple[Interface, Mapping[str, Any]]], now: float, wall_ms: int) -> Send:
         """Return the frames that set several interfaces, for one write. Raises PayloadError if any cannot be set."""
         data, payloads = b"", [_packed(interface, values) for interface, values in wanted]
@@ -235,7 +230,7 @@ class Session:
         manifest = self.known.get(hello)
         if manifest is not None:
             self.known.move_to_end(hello)
-            yield from self._begin(Described(manifest, remembered=True))
+            yield from self._begin(Described(manifest))
         else:  # a repeated HELLO does not delay the request
             self._ask_at = min(now + ASK_AFTER_HELLO_S, self._ask_at or float("inf"))
 

@@ -21,7 +21,7 @@ RESERVED, LOCAL_ONLY = "describe", "local-only"
 MOST_INTERFACES = 64  # with 64 fields each they exceed FRAME_LIMIT: frame.py says what fits
 _MOST_FIELDS = 64  # of one interface
 _MOST_LEVELS = 8  # of a channel
-_ENCODINGS = {1: "struct_v1"}  # by number: so far there is one, so no interface stores which it has
+_ENCODING_NUMBER, _ENCODING_NAME = 1, "struct_v1"  # so far there is one, so no interface stores which it has
 _RETAIN, _LOCAL_ONLY = 1, 2  # bits of an interface's flags; the others are reserved
 
 _level = re.compile(LEVEL).search
@@ -170,7 +170,7 @@ def _interface(reader: _Reader) -> Interface:
         raise PayloadError(f'interface name "{name}" is taken')
     if number == 0:
         raise PayloadError(f"{name}: id 0 is the protocol's own")
-    if encoding not in _ENCODINGS:
+    if encoding != _ENCODING_NUMBER:
         raise PayloadError(f"{name}: unknown encoding {encoding}")
     if count > _MOST_FIELDS:
         raise PayloadError(f"{name}: {count} fields, more than {_MOST_FIELDS}")
@@ -234,7 +234,6 @@ def _all_differ(what: str, values: list[Any]) -> None:
 
 
 def _plain_interface(interface: Interface) -> dict[str, Any]:
-    kind = _ENCODINGS[1]  # the only one
     plain: dict[str, Any] = {
         "id": interface.id,
         "name": interface.name,
@@ -243,7 +242,7 @@ def _plain_interface(interface: Interface) -> dict[str, Any]:
         "channel": interface.channel,
         "profile": interface.profile,
         "rate_hz": interface.rate_hz,
-        "encoding": {"kind": kind, "fields": [_plain_field(field) for field in interface.fields]},
+        "encoding": {"kind": _ENCODING_NAME, "fields": [_plain_field(field) for field in interface.fields]},
     }
     flags = {"retain": interface.retain, "local_only": interface.local_only}
     return plain | {name: True for name, is_set in flags.items() if is_set}

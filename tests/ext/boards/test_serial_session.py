@@ -68,7 +68,7 @@ class Host:
         manifest = self.session.manifest
         assert manifest is not None
         interface = next(one for one in manifest.interfaces if one.name == name)
-        send = self.session.command(interface, values, self.now, WALL_MS)
+        send = self.session.commands([(interface, values)], self.now, WALL_MS)
         self._take([send])
         return self.sent[-1][1]
 
@@ -129,7 +129,7 @@ def test_a_known_hello_makes_a_device_usable_at_once(host: Host) -> None:
     assert host.session.closed() == [Gone("the line is gone")]
     host.session.opened(host.now)
     (described,) = host.feed(HELLO)
-    assert described == Described(host.of(Described)[0].manifest, remembered=True)
+    assert described == host.of(Described)[0]
     assert [type(event) for event in host.feed(state())] == [Reading]
     host.until(host.now + 4)
     assert host.asked() == []
@@ -236,7 +236,7 @@ def test_groups_wait_in_eight_places_whatever_they_set(host: Host) -> None:
         for order in [(first, second), (second, first)] * 20
     ]
     assert len(set(kinds)) == WAITING
-    assert host.session.command(first, {"on": True}, host.now, WALL_MS).kind not in kinds
+    assert host.session.commands([(first, {"on": True})], host.now, WALL_MS).kind not in kinds
 
 
 def test_commands_without_an_answer_are_reported_and_not_remembered_for_ever(host: Host) -> None:

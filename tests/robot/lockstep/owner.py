@@ -43,13 +43,10 @@ class Wheels:
         self._scheduler = scheduler
         self._line = _STOP
         self._at = scheduler.now
-        self.lights = b""  # that came with the newest drive line
-        self.alone = 0  # lines of lights without one
         self.deadline = 0.0  # of the newest drive command that the line was given
 
     def receive(self, line: bytes) -> None:
-        drive, end, self.lights = line.partition(b"\n")
-        self._line, self._at = drive + end, self._scheduler.now
+        self._line, self._at = line, self._scheduler.now
 
     @property
     def speeds(self) -> tuple[int, int] | None:
@@ -80,18 +77,14 @@ class RecordedLine:
     def close(self) -> None:
         self._wheels.receive(_STOP)
 
-    def drive(self, line: bytes, valid_s: float, *, replaces: str = "") -> None:
+    def drive(self, line: bytes, valid_s: float) -> None:
         self._wheels.deadline = self._scheduler.now + valid_s
-        self._outbox.drive(line, self._scheduler.now, valid_s, replaces)
+        self._outbox.drive(line, self._scheduler.now, valid_s)
         self._pump()
 
     def halt(self) -> None:
         self._outbox.halt()
         self._pump()
-
-    def send(self, kind: str, line: bytes) -> None:
-        """Lights turn no wheel."""
-        self._wheels.alone += 1
 
     def _become_ready(self) -> None:
         """Unless the process has ended meanwhile."""
@@ -132,15 +125,15 @@ class MemoryFile:
 
     def save(self, value: Any) -> int:
         self._number += 1
-        number, life, written = self._number, self._process.connection, msgspec.json.encode(value)
+        number, life, written = self._number, self._process.connections, msgspec.json.encode(value)
 
         def write() -> None:
-            if self._process.connection is life:
+            if self._process.connections is life:
                 self._disk[self.path] = written
                 self._process.scheduler.after(_SAVED_S, lambda: self._process.do(saved))
 
         def saved() -> None:
-            if self._process.connection is life:
+            if self._process.connections is life:
                 self.busy = number < self._number
                 self._on_saved(number, True)
                 self._process.wake()
@@ -206,18 +199,17 @@ _PING_S = 0.45
 class Outside(Network):
     """The operators' broker: all that it has for the bridge waits in one queue, but for the connection of stops.
 
-    ``heard(sender, message)``: it has a message; ``comes(message)``: the bridge has it.
+    ``comes(message)``: the bridge has a message.
     """
 
     def __init__(
         self,
         scheduler: Scheduler,
-        heard: Callable[[Process, Message], None],
         sent: Callable[[Process, Message], None],
         comes: Callable[[Message], None],
     ) -> None:
         super().__init__(scheduler, lambda _process, _message: None, sent)
-        self._heard, self.comes = heard, comes
+        self.comes = comes
         self._floods: list[tuple[float, float]] = []  # until when what comes has to wait so long
         self._stalled_until = self._free_at = 0.0
 
@@ -245,10 +237,9 @@ class Outside(Network):
             return
         at = max(self.scheduler.now + _TRAVEL_S + sender.delay, self._last.get((sender, client), 0.0))
         self._last[sender, client] = at
-        self.scheduler.at(at, lambda: self._queue(delivery, client, number, sender))
+        self.scheduler.at(at, lambda: self._queue(delivery, client, number))
 
-    def _queue(self, delivery: Any, client: Remote, number: int, sender: Process) -> None:
-        self._heard(sender, delivery.message)
+    def _queue(self, delivery: Any, client: Remote, number: int) -> None:
         came = self.scheduler.now
 
         def arrive() -> None:
@@ -318,46 +309,28 @@ class Bridge(ServiceProcess):
 
     def __init__(self, inside: Network, outside: Outside, config: Config) -> None:
         super().__init__("bridge", inside.scheduler, lambda process: self._service(inside, outside, config))
-        self.remote: Remote | None = None
-        self.stops: Remote | None = None
-        self._local: Connection | None = None
 
     def _service(self, inside: Network, outside: Outside, config: Config) -> MqttBridge:
-        self._local = Connection(self, inside)
-        remote, stops = Remote(self, outside), Remote(self, outside, of_stops=True)
-        self.remote, self.stops = remote, stops
+        local, remote, stops = Connection(self, inside), Remote(self, outside), Remote(self, outside, of_stops=True)
         with (
             patch.object(bridge_module, "remote_transport", lambda *_arguments, **_options: remote),
             patch.object(bridge_module, "stops_transport", lambda _config: stops),
             patch.object(robot_audit, "Audit", Unwritten),
         ):
-            return MqttBridge(config, self._local, clock=self.scheduler.clock)
+            return MqttBridge(config, local, clock=self.scheduler.clock)
 
     @property
     def reaches_owners(self) -> bool:
         """True if it runs and has its connection to the robot."""
-        return self.alive and not self.frozen and self._local is not None and self._local._present
-
-    @property
-    def _connections(self) -> list[Connection]:
-        return [one for one in (self._local, self.remote, self.stops) if one is not None]
-
-    def thaw(self) -> None:
-        frozen_s = self.scheduler.now - self.frozen_at
-        for connection in self._connections if self.frozen else ():
-            connection.silent(frozen_s)
-        super().thaw()
+        return self.alive and not self.frozen and self.connections[0]._present
 
     def lose(self, seconds: float, *, local: bool) -> None:
         """Lose one of the two connections for so long."""
-        connection = self._local if local else self.remote
-        assert connection is not None
-        connection.lose(seconds)
+        self.connections[0 if local else 1].lose(seconds)
 
     def lose_stops(self, noticed_s: float, seconds: float) -> None:
         """Lose the connection of stops; that is noticed after a while, and it is made again."""
-        stops = self.stops
-        assert stops is not None
+        stops: Any = self.connections[2]
         stops.deaf = True
 
         def notice() -> None:
@@ -368,10 +341,5 @@ class Bridge(ServiceProcess):
 
     def find(self) -> None:
         """Find what was lost."""
-        for connection in self._connections:
+        for connection in self.connections:
             connection.find()
-
-    def leave(self) -> None:
-        super().leave()
-        for connection in self._connections:
-            connection.network.crash(connection)

@@ -7,13 +7,9 @@ Every step is possible at any time, and does nothing where it has no meaning, so
 * The second one is moved only by whom the first has named less than 1.5 s ago.
 * A script moves neither within 1.2 s after a person's command is over, that is, 2 s after it was sent.
 * In the end, when everything works, who takes control drives both.
-* Lights of a group shine with its drive command, in one write, or not at all; copies of its members have no effect.
 
-Every other layout has a bridge, persons are beyond it, and floods hold up what they send. Then, too:
-
-* Nobody loses control by silence or idleness, unless the operators' broker had nothing of theirs for so long.
-* Control ends 30 s after the last message of its holder that the first owner was sent.
-* The rules of stops: :mod:`tests.robot.lockstep.stop_rules`.
+Persons are beyond a bridge, and floods hold up what they send. The rules of stops are those of
+:mod:`tests.robot.lockstep.stop_rules`.
 """
 
 from __future__ import annotations
@@ -27,11 +23,11 @@ from itertools import count
 from pathlib import Path
 
 from pebble.config import Config, load
-from pebble.contract import CONTROL_STATE, CONTROL_TURN, CONTROL_VOUCHED, ESTOP_STATE, codec
+from pebble.contract import CONTROL_STATE, CONTROL_TURN, ESTOP_STATE, codec
 from pebble.runtime.process import view_of
 from pebble.transports import Message, QoS
-from tests.kit.schedules import Engine, Outcome, RandomSteps, Steps, perform_steps
-from tests.robot.lockstep.drivers import BASE, SCRIPT, STRANGER, Commands, Driver, Holders
+from tests.kit.schedules import Engine, Steps
+from tests.robot.lockstep.drivers import BASE, SCRIPT, STRANGER, Commands, Driver
 from tests.robot.lockstep.network import Network, Process, Scheduler
 from tests.robot.lockstep.owner import Bridge, Disk, Outside, Owner, Wheels
 from tests.robot.lockstep.stop_rules import StopRules
@@ -54,18 +50,15 @@ _LAGS_S = (0.6, 0.8, 1.5, 2.5, 4.0)
 _WRITES_S = (1.2, 0.05, 0.005)  # to a disk
 
 
-def configuration(folder: Path, strangers: str, *, bridged: bool = False, groups: bool = False) -> Config:
+def configuration(folder: Path, strangers: str = "free") -> Config:
     """A robot of two motor owners, whose files are in ``folder``."""
     lines = {"enabled": True, "serial": {"port": str(folder / "tty")}}
     lines["instances"] = {FIRST: {"serial": {"port": str(folder / "tty-arm")}}}
     transport = {"kind": "mqtt", "state_dir": str(folder / "state"), "run_dir": str(folder / "run")}
     raw = {"robot": {"id": "goob"}, "transport": transport, "local_mqtt": {"host": "127.0.0.1"}}
-    raw |= {"services": {"serial_mcu_bridge": lines}, "security": {"strangers": strangers}}
-    raw["services"]["mqtt_bridge"] = {"link": {"groups": groups}}  # type: ignore[index]
-    if bridged:
-        heartbeat, remote = {"enabled": False}, {"host": "127.0.0.1"}
-        raw["services"]["mqtt_bridge"] |= {"enabled": True, "heartbeat": heartbeat, "remote_mqtt": remote}  # type: ignore[index]
-    path = folder / f"{strangers}-{bridged}.json"
+    bridge = {"enabled": True, "heartbeat": {"enabled": False}, "remote_mqtt": {"host": "127.0.0.1"}}
+    raw |= {"services": {"serial_mcu_bridge": lines, "mqtt_bridge": bridge}, "security": {"strangers": strangers}}
+    path = folder / f"{strangers}.json"
     path.write_text(json.dumps(raw))
     return load(path)
 
@@ -78,24 +71,21 @@ class TwoOwners:
         self.scheduler = Scheduler(10_000.0)
         self.commands = Commands()
         self.network = Network(self.scheduler, self._arrived, self._published)
-        self.holders = Holders(self.scheduler, FIRST)
-        self.outside = Outside(self.scheduler, self.holders.heard, self._sent, self._comes)
-        self.bridge = Bridge(self.network, self.outside, config) if config.services.mqtt_bridge.enabled else None
+        self.outside = Outside(self.scheduler, self._sent, lambda message: self.stops.comes(message))
+        self.bridge = Bridge(self.network, self.outside, config)
         numbers = count(1)
         disk: Disk = {}
         self.owners = {
             name: Owner(
                 self.network, view_of(config, name.replace(SECOND, "")), disk, Wheels(self.scheduler),
                 instance=name.replace(SECOND, ""), token_hex=lambda size: f"{next(numbers):0{2 * size}x}",
-                writes_s=_WRITES_S[layout % len(_WRITES_S)] if self.bridge is not None else 0.0,
+                writes_s=_WRITES_S[layout % len(_WRITES_S)],
             )
             for name in (FIRST, SECOND)
         }  # fmt: skip
-        self.stops = None if self.bridge is None else StopRules(self.scheduler, self.bridge, self.owners)
-        away = self.network if self.bridge is None else self.outside
-        networks = {"ann": away, "eve": away, STRANGER: self.network}
-        groups = config.services.mqtt_bridge.link.groups
-        self.drivers = {name: Driver(name, net, self.commands, groups=groups) for name, net in networks.items()}
+        self.stops = StopRules(self.scheduler, self.bridge, self.owners)
+        networks = {"ann": self.outside, "eve": self.outside, STRANGER: self.network}
+        self.drivers = {name: Driver(name, net, self.commands) for name, net in networks.items()}
         self.moved: set[tuple[str, str]] = set()  # (owner, driver)
         self._person_at: dict[str, float] = {}  # by owner: when a person moved it last
         self._granted: list[tuple[float, str]] = []  # when, and to whose id; what the first tells the second
@@ -105,24 +95,18 @@ class TwoOwners:
         for owner in self.owners.values():
             owner.after = partial(self._turned, owner)
             owner.start()
-        if self.bridge is not None:
-            self.bridge.start()
-            self.scheduler.run(1.5)
+        self.bridge.start()
+        self.scheduler.run(1.5)
         self._check_again()
         self.scheduler.run(0.8)
 
     # -- rules
 
-    def _sent(self, _process: Process, message: Message) -> None:
-        if self.stops is not None and _process is not self.bridge:
+    def _sent(self, process: Process, message: Message) -> None:
+        if process is not self.bridge:
             self.stops.sent(message)
 
-    def _comes(self, message: Message) -> None:
-        if self.stops is not None:
-            self.stops.comes(message)
-
-    def _stops_published(self, process: Process, message: Message) -> None:
-        assert self.stops is not None
+    def _published(self, process: Process, message: Message) -> None:
         if process is self.bridge:
             self.stops.passes(message)
         elif process in self.drivers.values():
@@ -130,43 +114,25 @@ class TwoOwners:
         for name, owner in self.owners.items():
             if process is owner and message.topic == ESTOP_STATE.topic(BASE, owner=name):
                 self.stops.shows(name, message.payload)
-
-    def _published(self, process: Process, message: Message) -> None:
-        if self.stops is not None:
-            self._stops_published(process, message)
         if process is self.owners[FIRST] and message.topic == CONTROL_TURN.topic(BASE, owner=FIRST):
             turn = codec.decode(CONTROL_TURN, message.payload)
             self._recorded = [*self._recorded, message][-8:]
             self._granted = [*self._granted, (self.scheduler.now, turn.id)][-100:]
-            if self.bridge is not None:
-                self.holders.granted(turn, {driver.id: driver for driver in self.drivers.values()})
         elif process is self.owners[FIRST] and message.topic == CONTROL_STATE.topic(BASE, owner=FIRST):
             self._shown = self.scheduler.now, codec.decode(CONTROL_STATE, message.payload).id
-        elif message.topic == CONTROL_VOUCHED.topic(BASE):
-            self.holders.vouched(codec.decode(CONTROL_VOUCHED, message.payload))
 
     def _arrived(self, process: Process, message: Message) -> None:
-        if process is self.owners[FIRST]:
-            self.holders.arrived(message)
-        elif self.stops is not None and process is self.bridge:
+        if process is self.bridge:
             self.stops.learns(message)
 
     def _turned(self, owner: Owner) -> None:
         late = self.scheduler.now > owner.wheels.deadline + _MS
         self.scheduler.check(not late or owner.wheels.speeds is None, "a wheel turns after its command's deadline")
-        wheels = owner.wheels
-        if wheels.speeds is not None:
-            left, right = wheels.speeds
-            lights = b"L 1.000 %.3f %.3f\n" % (left / 1000, right / 1000)
-            expected = lights if wheels.speeds in self.commands.grouped else b""
-            self.scheduler.check(wheels.lights == expected, "half a group is obeyed")
-        self.scheduler.check(not wheels.alone, "the copy of a member is obeyed, too")
         self.check()
 
     def _check_again(self) -> None:
         self.check()
-        if self.stops is not None:
-            self.stops.check()
+        self.stops.check()
         self.scheduler.after(_CHECK_S, self._check_again)
 
     @property
@@ -270,7 +236,7 @@ class TwoOwners:
             self.drivers[STRANGER].publish_raw(topic, b"", retain=True)
 
     def do_lose_stops(self, a: int, b: int) -> None:
-        if self.bridge is not None and self.bridge.alive and self.stops is not None:
+        if self.bridge.alive:
             self.stops.doubtful = True
             self.bridge.lose_stops(_LAGS_S[a % 4], _DOWN_S[b % len(_DOWN_S)] + 0.4)
 
@@ -299,10 +265,9 @@ class TwoOwners:
 
     def do_bridge(self, a: int, b: int) -> None:
         """The bridge is killed, frozen, or loses a connection."""
-        if self.bridge is None or not self.bridge.alive or self.bridge.frozen:
+        if not self.bridge.alive or self.bridge.frozen:
             return
         if a % 4 == 0:
-            assert self.stops is not None
             self.bridge.kill(_DOWN_S[b % len(_DOWN_S)])
             self.stops.begin()
         elif a % 4 == 1:
@@ -312,13 +277,12 @@ class TwoOwners:
 
     def do_delay(self, a: int, b: int) -> None:
         process: Process = self._anybody(a) if a % 2 else self._owner(a // 2)
-        if a == 4 and self.bridge is not None:
+        if a == 4:
             process = self.bridge
         process.delay = _DELAYS_S[b % len(_DELAYS_S)]
 
     def do_lose(self, a: int, b: int) -> None:
-        connection = self._owner(a).connection
-        if connection is not None:
+        for connection in self._owner(a).connections:
             connection.lose(_DOWN_S[b % len(_DOWN_S)])
 
     def do_repeat(self, a: int, b: int) -> None:
@@ -334,9 +298,7 @@ class TwoOwners:
         payload = old.payload if fields is None else json.dumps(fields | {"boot": turn.boot[::-1]}).encode()
         topic = CONTROL_TURN.topic(BASE, owner=FIRST)
         self.network.retained[topic] = Message(topic, payload, QoS.DELIVERED, retain=True)
-        connection = self.drivers[STRANGER].connection
-        assert connection is not None
-        self.network.publishers[topic] = connection
+        self.network.publishers[topic] = self.drivers[STRANGER].connections[0]
 
     def _person(self, a: int) -> Driver:
         return self.drivers[("ann", "eve")[a % 2]]
@@ -351,26 +313,23 @@ class TwoOwners:
 
     def rest(self) -> None:
         """Everything works again; then who takes control drives both."""
-        bridges = () if self.bridge is None else (self.bridge,)
-        for process in (*self.owners.values(), *self.drivers.values(), *bridges):
+        for process in (*self.owners.values(), *self.drivers.values(), self.bridge):
             process.delay = 0.0
             process.thaw()
         self.outside.calm()
-        for bridge in bridges:
-            bridge.find()
-        self.scheduler.run(5.2 if bridges else 3.2)
+        self.bridge.find()
+        self.scheduler.run(5.2)
         for driver in self.drivers.values():
             driver.let_go(release=driver.name != STRANGER)
         self.scheduler.run(0.2)
         for owner in self.owners.values():
             owner.start()
         ann = self.drivers["ann"]
-        if self.stops is not None:
-            ann.stop()
-            self.scheduler.run(4.0)
-            repeats = self.stops.repeated_at > self.scheduler.now - 1.0
-            self.scheduler.check(self.stops.all_latched, "a motor owner cannot be stopped any more")
-            self.scheduler.check(not repeats, "the repetition of a stop does not end")
+        ann.stop()
+        self.scheduler.run(4.0)
+        repeats = self.stops.repeated_at > self.scheduler.now - 1.0
+        self.scheduler.check(self.stops.all_latched, "a motor owner cannot be stopped any more")
+        self.scheduler.check(not repeats, "the repetition of a stop does not end")
         for _ in range(3):
             ann.reset()
             self.scheduler.run(0.3)
@@ -397,42 +356,31 @@ _HANDOVERS = {
     "wait": 30, "take": 10, "hold": 4, "let_go": 8, "steer": 16, "stranger": 8, "old_key": 4, "freeze": 4, "kill": 3,
     "delay": 4, "repeat": 3,
 }  # fmt: skip
-
-
 _STOPPED = {
     "wait": 34, "stop": 10, "stop_again": 8, "nameless": 4, "many": 1, "reset": 12, "kill": 6, "freeze": 8, "lag": 2,
     "bridge": 1, "lose_stops": 1, "withdraw": 1, "delay": 2, "repeat": 1,
 }  # fmt: skip
 
 
-STEPS = RandomSteps(
-    *(_ALL, _HANDOVERS, _FLOODED, _STOPPED),
-    length=36,
-    layouts=18,
-    begin=[("take", 0, None), ("steer", 0, None), ("wait", 0, None)],
-)
-
-
 @contextmanager
-def configs(*, groups: bool = False) -> Iterator[tuple[Config, ...]]:
+def configs(_kind: str) -> Iterator[tuple[Config, ...]]:
     with tempfile.TemporaryDirectory(prefix="pbl") as folder:
-        kinds = [(strangers, bridged) for bridged in (False, True, True) for strangers in ("free", "refuse")]
-        yield tuple(
-            configuration(Path(folder), strangers, bridged=bridged, groups=groups) for strangers, bridged in kinds
-        )
+        yield tuple(configuration(Path(folder), strangers) for strangers in ("free", "refuse"))
 
 
-def _perform(configs: tuple[Config, ...], schedule: Steps) -> Outcome:
+def _perform(configs: tuple[Config, ...], schedule: Steps) -> None:
     layout, steps = schedule
     world = TwoOwners(layout, configs)
-    perform_steps(world, steps)
+    for action, a, b in steps:
+        getattr(world, "do_" + action)(a, b)
     world.rest()
-    return Outcome()
 
 
 ENGINE = Engine(
-    draw=STEPS,
-    world=lambda kind: configs(groups=kind == "groups"),  # what schedules share
+    mixes=(_ALL, _HANDOVERS, _FLOODED, _STOPPED),
+    length=36,
+    layouts=2 * len(_WRITES_S),
+    begin=[("take", 0, None), ("steer", 0, None), ("wait", 0, None)],
+    world=configs,  # what schedules share
     perform=_perform,
-    kinds=("owners", "groups"),
 )

@@ -16,7 +16,7 @@ from pebble.config import Security
 from pebble.contract import CONTROL_STATE, codec
 from pebble.contract.payloads import ControlRequest, ControlState, ControlTurn, Drive
 from pebble.motors.control import Control
-from pebble.motors.vouched_lease import VouchedLease
+from pebble.motors.shared_lease import SharedLease
 
 
 def test_states_are_published_when_they_change_and_not_more_than_four_times_a_second(
@@ -261,13 +261,13 @@ HISTORIES: dict[str, tuple[tuple[Any, ...], ...]] = {
 }  # fmt: skip
 
 
-def vouched_lease(vouched: tuple[int, int] | None) -> VouchedLease:
-    made = VouchedLease(0, operator.sub, "{:08x}".format, 0)
+def vouched_lease(vouched: tuple[int, int] | None) -> SharedLease:
+    made = SharedLease(frozenset(), 0, operator.sub, "{:08x}".format, 0)
     made.vouched = vouched
     return made
 
 
-def perform(own: VouchedLease, events: tuple[tuple[Any, ...], ...]) -> None:
+def perform(own: SharedLease, events: tuple[tuple[Any, ...], ...]) -> None:
     for at, what, *rest in events:
         now = round(1000 * at)
         if what == "hold":

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import random
 import signal
 import struct
 import threading
@@ -176,19 +175,6 @@ def test_any_number_of_runs_never_displaces_the_person() -> None:
     assert inbox.dropped == 999 - 7
 
 
-def test_a_zero_of_every_sender_is_always_there_whatever_follows() -> None:
-    for seed in range(100):
-        chance = random.Random(seed)
-        inbox, zeros = empty(), set()
-        for _ in range(chance.randrange(1, 30)):
-            run, z = chance.randrange(4), chance.choice((0.0, 0.0, 1.0))
-            inbox.put_drive(script(run, z) if run else Drive(z=z), 0.0)
-            zeros |= {run} if not z else set()
-        waiting = drives(inbox)
-        assert {drive.run if drive.signed else 0 for drive in waiting if not drive.moves} == zeros
-        assert len(waiting) <= 8
-
-
 def test_stops_have_one_place_per_name_and_are_bounded_and_so_are_resets() -> None:
     inbox, names = empty(), [f"{number:016x}" for number in range(20)]
     assert inbox.put_drive(Drive(), 0.0)
@@ -327,15 +313,6 @@ def test_every_byte_is_where_the_original_has_it(path: Path, memory: HallMemory)
     rows = [(1, 5, 512, -498, 7, 1), (2, 6, 1, 2, 3, 0), (3, 7, 4, 5, 6, -1)]
     assert raw[24:].rstrip(b"\0") == b"".join(struct.pack("<QQiiii", *row) for row in rows)
     assert path.stat().st_mode & 0o777 == 0o600
-
-
-def test_a_reader_sees_each_sample_once_and_the_newest_ones_if_it_is_late(path: Path, memory: HallMemory) -> None:
-    fill(memory, 1)
-    reader = HallReader(path.name)
-    fill(memory, 10)
-    assert [sample.a0 for sample in reader.read()] == list(range(10))
-    fill(memory, 3 * SLOTS)
-    assert [sample.a0 for sample in reader.read()] == list(range(2 * SLOTS, 3 * SLOTS))
 
 
 def test_the_newest_number_never_goes_back(path: Path, memory: HallMemory) -> None:

@@ -160,14 +160,6 @@ def test_at_most_four_states_a_second_and_the_last_one_is_published(rig: Rig) ->
     assert rig.states[-1].recent == [f"{number:016x}" for number in range(89, 81, -1)]
 
 
-def test_repetitions_get_the_state_again_and_do_not_delay_what_confirms_a_stop(rig: Rig) -> None:
-    for _ in range(10):
-        rig.stop(A)
-        rig.advance(0.01)
-    assert rig.written()
-    assert (rig.states[-1].recent, rig.states[-1].persisted) == ([A], True)
-
-
 def test_a_repetition_is_answered_a_quarter_of_a_second_after_the_last_state(rig: Rig) -> None:
     rig.stop(A)
     assert rig.written()
