@@ -14,11 +14,14 @@ from typing import Any
 import pytest
 
 from pebble.config import SystemControl, load
-from pebble.contract import CHANNELS, GIT_PULL, REBOOT, Kind
+from pebble.contract import CHANNELS, CONTROL_VOUCHED, GIT_PULL, REBOOT, Kind, codec
+from pebble.forwarding.routing import Drop
+from pebble.forwarding.side import Side
 from pebble.runtime.parent import Notifier
 from pebble.services.mqtt_bridge.motor_owners import MotorOwners
 from pebble.services.mqtt_bridge.requests.actions import ACTIONS, LOOK_S, Action, Row
 from pebble.services.mqtt_bridge.requests.earlier_names import CallIn, EarlierNames, keep_stops
+from pebble.services.mqtt_bridge.service import MqttBridge
 from pebble.services.mqtt_bridge.vouching import Vouching
 from pebble.transports import Answer, Transport
 from pebble.transports.memory import MemoryHub, MemoryTransport
@@ -26,6 +29,7 @@ from tests.services.mqtt_bridge.bridge_rig import Client, MemoryRig
 from tests.support import WAIT_S, Clock, until
 
 START_S, PERIOD_S = 100.0, 0.5
+VOUCHED = CONTROL_VOUCHED.suffix
 
 #: Each half second: does it pass, what was lost, how old and how late the answer is (None: there is none); and from
 #: when to when it vouches then.
@@ -80,6 +84,34 @@ def test_of_a_transport_that_asks_nothing_a_connection_that_lasts_is_prompt() ->
     assert [(one.begin, one.end) for one in vouched] == [
         *((100_000, 100_000), (100_000, 100_000), (100_000, 101_000), (104_000, 104_000)),
     ]
+
+
+#: What may be a loss on the way to the motor owners, as a bridge counts it.
+LOSSES: dict[str, Callable[[MqttBridge, MemoryRig], None]] = {
+    "too late": lambda bridge, _: bridge.forwarder.counters.add(f"{Side.REMOTE.value}: {Drop.LATE.value}"),
+    "refused by the robot": lambda bridge, _: bridge.forwarder.counters.add(f"{Side.LOCAL.value}: refused"),
+    "dropped on the robot": lambda bridge, _: bridge.transport.counters.add("dropped"),
+    "an operator's broker of another time": lambda _, rig: restarted(rig.remote_hub),
+    "a robot's broker of another time": lambda _, rig: restarted(rig.local_hub),
+}
+
+
+def restarted(hub: MemoryHub) -> None:
+    hub.stop()
+    hub.start()
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_after_a_loss_it_vouches_anew(monkeypatch: pytest.MonkeyPatch, loss: str) -> None:
+    rig = MemoryRig(monkeypatch)
+    serial = {"enabled": True, "serial": {"port": "/dev/null"}}
+    bridge = rig.bridge(serial=serial, remote={"kind": "zenoh", "connect": ["tcp/127.0.0.1:7447"]})
+    begins = lambda: [codec.decode(CONTROL_VOUCHED, payload).begin for payload in rig.local.payloads(VOUCHED)]  # noqa: E731
+    assert until(lambda: len(begins()) > 1 and begins()[-1] == begins()[-2]), "it goes on to vouch from that time"
+    before = begins()[-1]
+    LOSSES[loss](bridge, rig)
+    assert until(lambda: begins()[-1] > before)
+    rig.close()
 
 
 #: A motor owner is reached while its repeated state arrives; a retained one proves nothing.
