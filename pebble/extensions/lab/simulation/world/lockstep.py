@@ -18,16 +18,9 @@ from pebble.extensions.lab.simulation.world.walls import Floor, motion_of
 from pebble.extensions.lab.simulation.world.world_file import LONGEST_EXPOSURE_MS, LONGEST_LATENCY_MS, World
 
 STEP_S: Final = 0.005  # one turn of the firmware's loop
+WIDTH, HEIGHT, FPS = 640, 480, 15.0  # of pictures
 _STEPS_PER_SAMPLE = round(PERIOD_S / STEP_S)
 _SAMPLES = round((LONGEST_LATENCY_MS + LONGEST_EXPOSURE_MS) / 1000 / PERIOD_S) + 2
-
-
-class CameraMode(NamedTuple):
-    """The size of pictures in pixels, and their number per second."""
-
-    width: int = 640
-    height: int = 480
-    fps: float = 15.0
 
 
 class Picture(NamedTuple):
@@ -50,11 +43,10 @@ class LockstepWorld:
                 goob.drive(x=0.0, z=0.3)
     """
 
-    def __init__(self, world: World, camera: CameraMode | None = None) -> None:
+    def __init__(self, world: World) -> None:
         self._steps = 0
         self.floor = Floor(world)
-        mode = camera or CameraMode()
-        self.robots = {name: LockstepRobot(world, name, self.floor, mode) for name in world.robots}
+        self.robots = {name: LockstepRobot(world, name, self.floor) for name in world.robots}
         self._sample()
 
     def now(self) -> float:
@@ -85,12 +77,12 @@ class LockstepWorld:
 class LockstepRobot:
     """A robot of a LockstepWorld, which calls ``tick`` and ``sample``: its serial line, camera and true state."""
 
-    def __init__(self, world: World, name: str, floor: Floor, camera: CameraMode) -> None:
+    def __init__(self, world: World, name: str, floor: Floor) -> None:
         self.name = name
         self.motion = motion_of(world, name, floor)
         self.mcu = SimulatedMcu(world.robots[name].kind, 0.0, motion=self.motion)
         self.tracks: dict[str, Track] = {}  # of all robots, by name; the world sets it
-        self._world, self._camera = world, camera
+        self._world = world
         self._renderer: Renderer | None = None  # made for the first picture: not every test has OpenCV to load
         self._now = 0.0
         self._output = b""  # of the MCU, not yet read
@@ -128,14 +120,14 @@ class LockstepRobot:
 
     def picture(self) -> Picture | None:
         """Return the newest picture, unless it was returned before. It is rendered only when asked for."""
-        number = int(self._now * self._camera.fps + 1e-6)  # rounding may leave it just below a whole number
+        number = int(self._now * FPS + 1e-6)  # rounding may leave it just below a whole number
         if number == self._newest_picture:
             return None
         self._newest_picture = number
-        at = number / self._camera.fps - self._world.camera.latency_ms / 1000
-        pixels = np.empty((self._camera.height, self._camera.width, 3), np.uint8)
+        at = number / FPS - self._world.camera.latency_ms / 1000
+        pixels = np.empty((HEIGHT, WIDTH, 3), np.uint8)
         if self._renderer is None:
-            self._renderer = Renderer(self._world, self.name, self._camera.width, self._camera.height)
+            self._renderer = Renderer(self._world, self.name, WIDTH, HEIGHT)
         self._renderer.render(self.tracks, round(at * 1e9), pixels)
         return Picture(pixels, at)
 
