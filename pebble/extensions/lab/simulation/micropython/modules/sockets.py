@@ -83,12 +83,15 @@ class HostNetwork:
             sock.close()
         self.radio.activate(False)
 
-    def _socket(self, kind: int) -> HostTcp | HostUdp:
+    def make(self, kind: int) -> BoardSocket:
+        """Return a new socket of this kind."""
+        return HostTcp(self) if kind == socket.SOCK_STREAM else HostUdp(self)
+
+    def _socket(self, kind: int) -> BoardSocket:
         if len(self.open) >= MAX_SOCKETS:
             raise OSError(errno.ENFILE, "too many sockets: one is not closed")
-        opened = HostTcp(self) if kind == socket.SOCK_STREAM else HostUdp(self)
-        self.open.append(opened)
-        return opened
+        self.open.append(self.make(kind))
+        return self.open[-1]
 
 
 def socket_module(make: Any) -> SimpleNamespace:
