@@ -15,7 +15,7 @@ from pebble.extensions.recordings.files.writer import RecordingWriter
 from pebble.extensions.recordings.recorder.recorder import Recorder
 from pebble.extensions.recordings.recorder.settings import Options
 from tests.commands.command_line import Run
-from tests.ext.recordings.messages import START_NS
+from tests.ext.recordings.playing import THEN_NS
 from tests.support import refused
 
 GOOB, FRED = "pebble/robots/goob", "pebble/robots/fred"
@@ -204,8 +204,8 @@ def test_a_foreign_file_cannot_forge_lines(tmp_path: Path, run: Run) -> None:
             b"[" * 9000,
             b'{"event":"gap","since":1,"until":-9}',
         ):
-            writer.add(events, START_NS, payload)
-        writer.add(channel, START_NS, b"\x1b[2J\n")
+            writer.add(events, THEN_NS, payload)
+        writer.add(channel, THEN_NS, b"\x1b[2J\n")
         writer.finish()
     for command in ("info", "list", "search"):
         assert (run("recordings", command, path), run.err.count("\n") <= 1) == (0, True)
