@@ -40,6 +40,10 @@ class Body:
         self._motors = self._reported = (0.0, 0.0)  # as the outputs set them, and as on_motors was told last
         self._outputs_changed = False  # since they were last read
         board.pins.before_change = self.before_output_change
+        self.connect()
+
+    def connect(self) -> None:
+        """Connect sensors and devices to the board."""
 
     def before_output_change(self) -> None:
         """Advance motion and battery to the present time before an output of the board changes.
@@ -124,8 +128,7 @@ class Goob(TwoWheeled):
 
     kind = "goob"
 
-    def __init__(self, board: Board, motion: RobotMotion | None = None) -> None:
-        super().__init__(board, motion)
+    def connect(self) -> None:
         self.measure_wheels()
         self.measure_battery()
 
@@ -142,10 +145,9 @@ class Fred(TwoWheeled):
 
     kind = "fred"
 
-    def __init__(self, board: Board, motion: RobotMotion | None = None) -> None:
-        super().__init__(board, motion)
+    def connect(self) -> None:
         self.measure_wheels()
-        board.set_pin(self.pins.CHARGE, lambda: self.battery.charging)
+        self.board.set_pin(self.pins.CHARGE, lambda: self.battery.charging)
 
     def light(self) -> list[float]:
         """Return the brightness of blue, green and red, 0..1."""
@@ -158,8 +160,7 @@ class Minilamp(TwoWheeled):
     kind = "minilamp"
     cells = 1
 
-    def __init__(self, board: Board, motion: RobotMotion | None = None) -> None:
-        super().__init__(board, motion)
+    def connect(self) -> None:
         self.measure_battery()
 
 
@@ -169,11 +170,10 @@ class Benjr(Body):
     kind = "benjr"
     cells = 1
 
-    def __init__(self, board: Board, motion: RobotMotion | None = None) -> None:
-        super().__init__(board, motion)
+    def connect(self) -> None:
         self.shield = MotorShield()
         self.shield.before_change = self.before_output_change
-        board.bus.attach(self.pins.MOTOR_SHIELD, self.shield)
+        self.board.bus.attach(self.pins.MOTOR_SHIELD, self.shield)
         self.measure_battery()
 
     def outputs(self) -> Pair:
