@@ -37,7 +37,7 @@ class Body:
         self.on_motors: Callable[[float, Pair], None] = lambda _now, _motors: None
         self._advanced_at = board.clock.now()  # the time to which motion and battery are advanced
         self._changed_at = self._advanced_at  # when an output last changed
-        self._motors = self._reported = (0.0, 0.0)  # as the outputs set them, and as on_motors was told last
+        self._motors = self.motors = (0.0, 0.0)  # as the outputs set them, and as on_motors was told last
         self._outputs_changed = False  # since they were last read
         board.pins.before_change = self.before_output_change
         self.connect()
@@ -61,9 +61,9 @@ class Body:
     def end_turn(self) -> None:
         """End a turn of the firmware: call ``on_motors`` if the motors have changed."""
         self._read_outputs()
-        if self._motors != self._reported:
-            self._reported = self._motors
-            self.on_motors(self._changed_at, self._motors)
+        if self._motors != self.motors:
+            self.motors = self._motors
+            self.on_motors(self._changed_at, self.motors)
 
     def advance(self) -> None:
         """Advance motion and battery to the present time."""

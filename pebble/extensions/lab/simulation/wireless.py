@@ -55,9 +55,9 @@ class WirelessRobot:
         self.board = Board(clock, self.network, uid, seed=secrets.randbits(64))  # other random numbers at each start
         self.board.files = Files(files)
         self.body = body_of(kind, self.board)
-        self.body.on_motors = self._moved
-        self._on_motors, self._moving_s = on_motors, moving_s
-        self._motors: Motors = (0.0, 0.0)
+        if on_motors is not None:
+            self.body.on_motors = on_motors
+        self._moving_s = moving_s
         if broker.tls is not None and broker.tls.ca_cert is not None:
             self.board.files[_CA_FILE] = _read(broker.tls.ca_cert)
         try:
@@ -76,7 +76,7 @@ class WirelessRobot:
 
     @property
     def moving(self) -> bool:
-        return any(self._motors)
+        return any(self.body.motors)
 
     @property
     def online(self) -> bool:
@@ -114,12 +114,6 @@ class WirelessRobot:
             tls = {"ca": _CA_FILE}
         login = {"username": broker.username, "password": broker.password} if broker.username is not None else {}
         return {"host": broker.host, "port": broker.port, "tls": tls, **login}
-
-    def _moved(self, now: float, motors: Motors) -> None:
-        """Note that the body's motors have changed."""
-        self._motors = motors
-        if self._on_motors is not None:
-            self._on_motors(now, motors)
 
 
 def _read(file: Path) -> bytes:

@@ -220,8 +220,7 @@ class VirtualNetwork(HostNetwork):
         self._wires.append(wire)
         return wire
 
-    def ask(self, place: Address, data: bytes) -> bytes | None:
-        """What a server at ``place`` answers to a datagram."""
+    def answer(self, data: bytes, place: Address) -> bytes | None:
         if place in NAME_SERVERS:
             known = {} if self.conditions.dns == "no such name" else self.hosts
             return self._spoilt(self.conditions.dns, name_answer(data, known.get))
@@ -305,7 +304,7 @@ class VirtualUdp(BoardSocket):
         self._need_wifi()
         network = self._network
         received = network.passable() and not network.conditions.mute
-        answer = network.ask(numeric(place), bytes(data)) if received else None
+        answer = network.answer(bytes(data), numeric(place)) if received else None
         if answer is not None:
             self._answers.append((network.clock.now() + 2 * network.conditions.latency_s(), answer, place))
         return len(data)

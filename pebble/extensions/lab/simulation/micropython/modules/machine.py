@@ -171,11 +171,11 @@ class SimulatedUart:
         self._console = self._board.console
 
     def any(self) -> int:
-        return self._console.unread
+        return len(self._console.typed)
 
     def readinto(self, buffer: bytearray | memoryview) -> int | None:
         """Read the available bytes into ``buffer``; return their number, None if there are none."""
-        data = self._console.take(min(len(buffer), self._console.unread))
+        data = self._console.take(min(len(buffer), self.any()))
         buffer[: len(data)] = data
         return len(data) or None
 
