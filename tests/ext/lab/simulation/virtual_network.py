@@ -51,7 +51,7 @@ class Wire:
         self._marks: deque[tuple[int, Command]] = deque()  # of the bytes that the board received
         self._in = self._out = 0  # bytes of the inbox so far
         self._session: Session | None = None
-        self._up: deque[tuple[float, bytes]] = deque()
+        self.up: deque[tuple[float, bytes]] = deque()  # writes that have not reached the other end
         self._down: deque[tuple[float, bytes, Command | None]] = deque()
         self._ends_as: State | None = None  # once the broker hung up
         self._retry_s = _FIRST_RETRY_S
@@ -71,11 +71,6 @@ class Wire:
         closed = self.state is State.CLOSED and (self._session is None or self._ends_as is not None)
         return closed or self.state in (State.FINISHED, State.RESET, State.REFUSED)
 
-    @property
-    def unacknowledged(self) -> int:
-        """Writes of the board that have not reached the other end."""
-        return len(self._up)
-
     # -- the board's end
 
     def take(self, size: int) -> bytes:
@@ -88,10 +83,10 @@ class Wire:
 
     def put(self, data: bytes) -> int:
         """Store what fits into the board's send buffer; return how many bytes that were."""
-        room = WINDOW - sum(len(piece) for _, piece in self._up)
+        room = WINDOW - sum(len(piece) for _, piece in self.up)
         data = data[: max(0, room)]
         if data:
-            self._up.append((self._due(self._up[-1][0] if self._up else 0.0), data))
+            self.up.append((self._due(self.up[-1][0] if self.up else 0.0), data))
         return len(data)
 
     def close(self) -> None:
@@ -128,13 +123,13 @@ class Wire:
             self.state = State.REFUSED
 
     def _carry_up(self) -> None:
-        while self._up and self._up[0][0] <= self._now() and self._session is not None:
-            _, data = self._up.popleft()
+        while self.up and self.up[0][0] <= self._now() and self._session is not None:
+            _, data = self.up.popleft()
             if self._ends_as is None:
                 self._session.feed(data)
             elif self.state is State.OPEN:
                 self.state = State.RESET  # the broker is not running
-        if self.state is State.CLOSED and not self._up and self._session is not None:
+        if self.state is State.CLOSED and not self.up and self._session is not None:
             session, self._session = self._session, None
             if self._ends_as is None:
                 session.close()
@@ -276,7 +271,7 @@ class VirtualTcp(BoardSocket, Stream):
         self._check(wire)
         if wire.state is State.CONNECTING and self._network.radio.platform == "esp32":
             raise failure(errno.EINPROGRESS)  # the ESP8266's lwIP takes early bytes
-        if self._network.radio.platform == "esp8266" and wire.unacknowledged >= _WRITES_8266:
+        if self._network.radio.platform == "esp8266" and len(wire.up) >= _WRITES_8266:
             self._network.clock.sleep(_STUCK_S)
             return None
         return wire.put(data) or None
@@ -310,15 +305,11 @@ class VirtualUdp(BoardSocket):
         return len(data)
 
     def recvfrom(self, size: int) -> tuple[bytes, Address]:
-        if not self.ready(POLLIN):
+        network = self._network
+        if not (network.passable() and self._answers and self._answers[0][0] <= network.clock.now()):
             raise failure(errno.EAGAIN)
         _, data, place = self._answers.popleft()
         return data[:size], place
-
-    def ready(self, mask: int) -> int:
-        """What poll() of the board reports."""
-        there = self._network.passable() and self._answers and self._answers[0][0] <= self._network.clock.now()
-        return ((POLLIN if there else 0) | POLLOUT) & mask
 
 
 # -- the broker
