@@ -85,8 +85,6 @@ def test_an_import_in_another_order_is_read_in_that_of_time(tmp_path: Path, run:
 
 
 def test_one_robot_is_deleted(folder: Path, run: Run) -> None:
-    assert run("recordings", "rm", folder, "--robot", "fred", "--yes", "--until", "2000-01-01T00:00") == 0
-    assert run.out.startswith(f"{FRED} from the beginning to 2000-01-01 00:00:00 ")
     assert run("recordings", "rm", folder, "--robot", "fred", "--yes") == 0
     assert run.out == "100 messages deleted\n"
     assert messages(folder) == 101
@@ -103,6 +101,7 @@ def test_one_robot_is_deleted(folder: Path, run: Run) -> None:
 )
 def test_the_period_of_a_deletion_is_named(folder: Path, run: Run, option: str, words: str, deleted: int) -> None:
     assert run("recordings", "rm", folder, "--robot", "fred", option, "2000-01-01T00:00:00Z", "--yes") == 0
+    assert run.out.startswith(f"{FRED} from ")  # in local time; where that is not UTC, in both
     assert run.out.endswith(f"{words}\n{deleted} messages deleted\n")
 
 

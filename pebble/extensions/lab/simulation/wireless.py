@@ -9,7 +9,7 @@ from typing import Any, Final
 from pebble.config.security import Security
 from pebble.contract.identity import Identity
 from pebble.errors import ConfigError
-from pebble.extensions.lab.simulation.bodies import body_of
+from pebble.extensions.lab.simulation.bodies import Pair, body_of
 from pebble.extensions.lab.simulation.micropython.board import Board
 from pebble.extensions.lab.simulation.micropython.clock import RealClock
 from pebble.extensions.lab.simulation.micropython.files import Files
@@ -23,8 +23,6 @@ KINDS: Final = ("minilamp", "benjr")
 _MOVING_S, _RESTING_S = 0.01, 0.05  # period of turns while sockets are idle
 _CA_FILE = "/ca.der"
 _OPEN = Security()
-
-Motors = tuple[float, float]
 
 
 class WirelessRobot:
@@ -43,7 +41,7 @@ class WirelessRobot:
         *,
         name: str = "",
         security: Security = _OPEN,
-        on_motors: Callable[[float, Motors], None] | None = None,
+        on_motors: Callable[[float, Pair], None] | None = None,
         moving_s: float = _MOVING_S,
         files: Path | None = None,
     ) -> None:
