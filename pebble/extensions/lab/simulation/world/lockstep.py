@@ -45,8 +45,8 @@ class LockstepWorld:
 
     def __init__(self, world: World) -> None:
         self._steps = 0
-        self.floor = Floor(world)
-        self.robots = {name: LockstepRobot(world, name, self.floor) for name in world.robots}
+        floor, tracks = Floor(world), dict[str, Track]()
+        self.robots = {name: LockstepRobot(world, name, floor, tracks) for name in world.robots}
         self._sample()
 
     def now(self) -> float:
@@ -69,24 +69,23 @@ class LockstepWorld:
     def _sample(self) -> None:
         for robot in self.robots.values():
             robot.sample()
-        tracks = {name: robot.track for name, robot in self.robots.items()}
-        for robot in self.robots.values():
-            robot.tracks = tracks
 
 
 class LockstepRobot:
     """A robot of a LockstepWorld, which calls ``tick`` and ``sample``: its serial line, camera and true state."""
 
-    def __init__(self, world: World, name: str, floor: Floor) -> None:
+    def __init__(self, world: World, name: str, floor: Floor, tracks: dict[str, Track]) -> None:
+        """Put the robot at its start. ``tracks``: those of all robots, to which its own is added."""
         self.name = name
         self.motion = motion_of(world, name, floor)
         self.mcu = SimulatedMcu(world.robots[name].kind, 0.0, motion=self.motion)
-        self.tracks: dict[str, Track] = {}  # of all robots, by name; the world sets it
         self._world = world
         self._renderer: Renderer | None = None  # made for the first picture: not every test has OpenCV to load
         self._now = 0.0
         self._output = b""  # of the MCU, not yet read
         self._samples: deque[Sample] = deque(maxlen=_SAMPLES)
+        self._tracks = tracks
+        tracks[name] = Track(self._samples)
         self._newest_picture = 0  # the number of the picture that was returned last
 
     @property
@@ -128,7 +127,7 @@ class LockstepRobot:
         pixels = np.empty((HEIGHT, WIDTH, 3), np.uint8)
         if self._renderer is None:
             self._renderer = Renderer(self._world, self.name, WIDTH, HEIGHT)
-        self._renderer.render(self.tracks, round(at * 1e9), pixels)
+        self._renderer.render(self._tracks, round(at * 1e9), pixels)
         return Picture(pixels, at)
 
     # -- for the world
@@ -139,7 +138,3 @@ class LockstepRobot:
 
     def sample(self) -> None:
         self._samples.append(Sample(round(self._now * 1e9), self.pose))
-
-    @property
-    def track(self) -> Track:
-        return Track(list(self._samples))
