@@ -20,8 +20,7 @@ from pebble.extensions.lab.simulation.i2c_devices import MotorShield
 from pebble.extensions.lab.simulation.micropython.board import Board
 from pebble.extensions.lab.simulation.micropython.clock import VirtualClock
 from pebble.extensions.lab.simulation.micropython.ports import OF_ROBOT
-from tests.ext.lab.simulation.virtual_broker import VirtualBroker
-from tests.ext.lab.simulation.virtual_network import VirtualNetwork
+from tests.ext.lab.simulation.virtual_network import VirtualBroker, VirtualNetwork
 from tests.kit.schedules import ViolatedError
 
 START_S: Final = 1000.0  # of the clock, when a drill begins
@@ -155,7 +154,7 @@ class Drill:
 
         A loop with something to read turns again soon: 10 ms for a kilobyte is what the slowest board needs.
         """
-        self.clock.advance(min(seconds, BUSY_S) if self.network.unread else seconds)
+        self.clock.advance(min(seconds, BUSY_S) if self.network.has_unread else seconds)
         while self._events and self._events[0][0] <= self.clock.now():
             heapq.heappop(self._events)[2]()
         self.network.step()

@@ -18,7 +18,7 @@ import pytest
 from pebble.commands import app
 from pebble.errors import PebbleError
 from pebble.extensions.lab.simulation.trace import read_trace
-from tests.ext.lab.simulation.virtual_broker import Session, VirtualBroker
+from tests.ext.lab.simulation.virtual_network import Session, VirtualBroker
 from tests.firmware.drill import BASE, DRIVE, ESTOP, LIMIT_S, RESET, STALE_S, STATE, Drill
 from tests.firmware.test_deadman_virtual import HOSTILE
 from tests.firmware.wireless_rig import Robots

@@ -111,17 +111,10 @@ def _moment(option: str, text: str, now: datetime, days: int = 0) -> int:
     except ValueError:
         _refuse(option, text)
     moment = moment if moment.tzinfo is not None else moment.replace(tzinfo=now.tzinfo)
-    if _is_day(text) and moment.date() < date.max:  # there is no day after date.max
+    is_day = len(text) <= len("2026-11-20") and "T" not in text  # else it has a time
+    if is_day and moment.date() < date.max:  # there is no day after date.max
         moment += days * _DAY
     return _ns(moment)
-
-
-def _is_day(text: str) -> bool:
-    try:
-        date.fromisoformat(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _refuse(option: str, text: str) -> NoReturn:

@@ -1,24 +1,28 @@
-"""Makes recordings, and plays them in virtual time."""
+"""Makes recordings; and two of the demo's robots.
+
+``DRIVE``: four robots that are driven and stopped, from their start on, without pictures and sound.
+``MEDIA``: Fred's pictures in json, pbvd, pbvz and h264, and its sound in PCM and Opus, a part of each.
+"""
 
 from __future__ import annotations
 
 import json
+import random
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from pebble.extensions.media.packets import Codec, Sound
+from pebble.extensions.recordings.files.reader import RecordingFile
+from pebble.extensions.recordings.files.recorded import Damage
 from pebble.extensions.recordings.files.writer import RecordingWriter
-from pebble.extensions.recordings.replay.player import BusOutput, Player
-from pebble.extensions.recordings.replay.rules import Options, Rules
-from pebble.extensions.recordings.replay.source import ReplaySource
 from pebble.extensions.recordings.stamps import stamp_ns
-from pebble.transports import Message
 
 GOOB, FRED = "pebble/robots/goob", "pebble/robots/fred"
 THEN_NS = 1_700_000_000 * 10**9  # when recordings of tests begin
-NOW_NS = 1_800_000_000 * 10**9  # when they are replayed
+STEP_NS = 10_000_000  # between messages of `write_random`
+DRIVE, MEDIA = (Path(__file__).parents[2] / "data" / "recordings" / f"{name}.mcap" for name in ("drive", "media"))
 
 
 class Line(NamedTuple):
@@ -71,51 +75,29 @@ def write(path: Path, lines: Iterable[Any], *, finished: bool = True, chunk_ns: 
     return path
 
 
-class Sent(NamedTuple):
-    at: float
-    message: Message
+def write_random(
+    path: Path, messages: int = 2000, *, finish: bool = True, channels: int = 20, each: int = 100
+) -> list[tuple[str, bytes]]:
+    """A file with random payloads, one chunk for every ``each`` of them; returns topics and payloads."""
+    rng = random.Random(messages)
+    topics = [f"pebble/robots/r{number}/outgoing/t{number}" for number in range(channels)]
+    lines = [
+        Line(number * STEP_NS / 1e9, rng.choice(topics), rng.randbytes(rng.randrange(200)))
+        for number in range(messages)
+    ]
+    write(path, lines, finished=finish, chunk_ns=each * STEP_NS)
+    return [(line.topic, line.payload) for line in lines]
 
 
-class Stage:
-    """A player in virtual time, and all that it publishes."""
+def contents(path: Path, **options: Any) -> list[tuple[str, bytes]]:
+    """Topics and payloads of what can be read."""
+    return read(path, **options)[0]
 
-    def __init__(self, path: Path | Sequence[Path], options: Options | None = None, **playing: Any) -> None:
-        self.seconds = 0.0  # which only waiting moves on
-        self.sent: list[Sent] = []
-        self.refuses = 0  # so many of the next messages
-        self.takes_s = 0.0  # for each message
-        self.waits = 0
-        self.actions: list[tuple[float, Any]] = []  # what to do at a time, in order
-        source = ReplaySource([path] if isinstance(path, Path) else path)
-        self.rules = Rules(options or Options(), source.channels)
-        output = BusOutput(self.rules, self._publish, lambda: NOW_NS + round(self.seconds * 1e9))
-        clocks = {"now": lambda: self.seconds, "wait": self._wait}
-        self.player = Player(source, self.rules.publishes, output, **clocks, **playing)
 
-    def run(self) -> Stage:
-        self.player.run()
-        return self
-
-    def at(self, seconds: float, action: Any) -> Stage:
-        self.actions.append((seconds, action))
-        return self
-
-    def payloads(self, topic: str) -> list[bytes]:
-        return [sent.message.payload for sent in self.sent if sent.message.topic == topic]
-
-    def _publish(self, message: Message) -> bool:
-        if self.refuses:
-            self.refuses -= 1
-            return False
-        self.seconds += self.takes_s
-        self.sent.append(Sent(self.seconds, message))
-        return True
-
-    def _wait(self, seconds: float) -> None:
-        self.waits += 1
-        self.seconds += seconds
-        while self.actions and self.seconds >= self.actions[0][0]:
-            self.actions.pop(0)[1]()
+def read(path: Path, **options: Any) -> tuple[list[tuple[str, bytes]], Damage]:
+    """Topics and payloads of what can be read, and what cannot."""
+    with RecordingFile(path) as file:
+        return [(message.channel.topic, message.payload) for message in file.read(**options)], file.damage
 
 
 def demo(seconds: float, robots: Sequence[str] = (GOOB, FRED)) -> Iterator[Line]:

@@ -29,7 +29,7 @@ from pebble.extensions.recordings.seek.archive import Archive
 from pebble.extensions.recordings.seek.days import Days
 from pebble.extensions.recordings.traffic.sources import sources
 from tests.commands.command_line import Run
-from tests.ext.recordings.messages import START_NS, STEP_NS, contents, read, write
+from tests.ext.recordings.playing import STEP_NS, THEN_NS, contents, read, write_random
 from tests.support import cases, refused
 
 GOOB, FRED = "pebble/robots/goob/outgoing/online", "pebble/robots/fred/outgoing/online"
@@ -58,7 +58,7 @@ def by_package(
     number = writer.register_schema(*SCHEMA)
     goob, fred = (writer.register_channel(topic, "json", number) for topic in (GOOB, FRED))
     for one in [*range(0, COUNT, 2), *range(1, COUNT, 2)] if interleaved else range(COUNT):
-        writer.add_message(fred if one % 4 == 3 else goob, START_NS + one * STEP_NS, payload(one), 0, sequence(one))
+        writer.add_message(fred if one % 4 == 3 else goob, THEN_NS + one * STEP_NS, payload(one), 0, sequence(one))
     writer.finish()
     return out.getvalue()
 
@@ -198,7 +198,7 @@ def test_what_cannot_be_read_is_named_and_not_touched(
 
 def test_a_flipped_bit_anywhere_costs_no_message_at_a_deletion(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    write(path, 60, channels=2, each=20)
+    write_random(path, 60, channels=2, each=20)
     data, chance = path.read_bytes(), random.Random(1)
     expected = [one for one in contents(path) if "/r0/" not in one[0]]
     left = 0
@@ -229,7 +229,7 @@ class TestInterrupted:
     @pytest.fixture
     def path(self, tmp_path: Path) -> Path:
         path = stored(tmp_path, b"")
-        write(path, 100, channels=2)
+        write_random(path, 100, channels=2)
         return path
 
     @pytest.mark.parametrize(
@@ -275,7 +275,7 @@ class TestNames:
 
     def test_what_a_deletion_does_not_look_into_is_named(self, tmp_path: Path, run: Run) -> None:
         whole_ = stored(tmp_path, b"")
-        write(whole_, 100, channels=2)
+        write_random(whole_, 100, channels=2)
         left = [
             stored(tmp_path, VALID["zstd"], f"{NAME.replace('001', '002')}{end}") for end in (".active", ".damaged")
         ]
@@ -290,7 +290,7 @@ class TestNames:
 
     def test_a_link(self, tmp_path: Path, run: Run) -> None:
         target, path = tmp_path / "rest.mcap", stored(tmp_path, b"")
-        written, before = write(target, 100, channels=2), target.read_bytes()
+        written, before = write_random(target, 100, channels=2), target.read_bytes()
         path.unlink()
         path.symlink_to(target)
         run("recordings", "rm", tmp_path / "rec", "--robot", "r0", "--yes")
@@ -309,7 +309,7 @@ class TestNames:
     def test_mending_takes_no_name_that_is_taken(self, tmp_path: Path, run: Run) -> None:
         whole_ = stored(tmp_path, VALID["zstd"])
         active = whole_.with_name(f"{NAME}.active")
-        write(active, 100, finish=False)
+        write_random(active, 100, finish=False)
         before = active.read_bytes()
         assert run("recordings", "mend", tmp_path / "rec") == 1
         assert "exists already" in run.err
@@ -322,7 +322,7 @@ class TestMending:
 
     def test_what_is_missing_is_counted_and_the_damaged_file_stays(self, tmp_path: Path, run: Run) -> None:
         path = stored(tmp_path, b"", f"{NAME}.active")
-        written = write(path, 100, finish=False, each=20, channels=1)
+        written = write_random(path, 100, finish=False, each=20, channels=1)
         with RecordingFile(path) as file:
             second = file.chunks[1]
         damaged = flipped(path.read_bytes(), second.at + second.length // 2)

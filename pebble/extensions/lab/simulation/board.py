@@ -81,11 +81,14 @@ class SimulatedMcu:
     def receive(self, data: bytes, now: float) -> bytes:
         """Process ``data``, which may end in the middle of a line; return the board's output."""
         output = self._advance(now, self.profile.tick_s)
-        self.board.console.type(data)
+        console = self.board.console
+        console.type(data)
         output += self._turn(now)
-        while (unread := self.board.console.unread) and self._clock.now() <= now:  # past ``now`` the firmware blocks
+        while (
+            unread := len(self.board.console.typed)
+        ) and self._clock.now() <= now:  # past ``now`` the firmware blocks
             output += self._turn(now)
-            if self.board.console.unread == unread:  # the firmware reads nothing now
+            if len(console.typed) == unread:  # the firmware reads nothing now
                 break
         return output
 

@@ -37,9 +37,13 @@ class Body:
         self.on_motors: Callable[[float, Pair], None] = lambda _now, _motors: None
         self._advanced_at = board.clock.now()  # the time to which motion and battery are advanced
         self._changed_at = self._advanced_at  # when an output last changed
-        self._motors = self._reported = (0.0, 0.0)  # as the outputs set them, and as on_motors was told last
+        self._motors = self.motors = (0.0, 0.0)  # as the outputs set them, and as on_motors was told last
         self._outputs_changed = False  # since they were last read
         board.pins.before_change = self.before_output_change
+        self.connect()
+
+    def connect(self) -> None:
+        """Connect sensors and devices to the board."""
 
     def before_output_change(self) -> None:
         """Advance motion and battery to the present time before an output of the board changes.
@@ -57,9 +61,9 @@ class Body:
     def end_turn(self) -> None:
         """End a turn of the firmware: call ``on_motors`` if the motors have changed."""
         self._read_outputs()
-        if self._motors != self._reported:
-            self._reported = self._motors
-            self.on_motors(self._changed_at, self._motors)
+        if self._motors != self.motors:
+            self.motors = self._motors
+            self.on_motors(self._changed_at, self.motors)
 
     def advance(self) -> None:
         """Advance motion and battery to the present time."""
@@ -124,8 +128,7 @@ class Goob(TwoWheeled):
 
     kind = "goob"
 
-    def __init__(self, board: Board, motion: RobotMotion | None = None) -> None:
-        super().__init__(board, motion)
+    def connect(self) -> None:
         self.measure_wheels()
         self.measure_battery()
 
@@ -142,10 +145,9 @@ class Fred(TwoWheeled):
 
     kind = "fred"
 
-    def __init__(self, board: Board, motion: RobotMotion | None = None) -> None:
-        super().__init__(board, motion)
+    def connect(self) -> None:
         self.measure_wheels()
-        board.set_pin(self.pins.CHARGE, lambda: self.battery.charging)
+        self.board.set_pin(self.pins.CHARGE, lambda: self.battery.charging)
 
     def light(self) -> list[float]:
         """Return the brightness of blue, green and red, 0..1."""
@@ -158,8 +160,7 @@ class Minilamp(TwoWheeled):
     kind = "minilamp"
     cells = 1
 
-    def __init__(self, board: Board, motion: RobotMotion | None = None) -> None:
-        super().__init__(board, motion)
+    def connect(self) -> None:
         self.measure_battery()
 
 
@@ -169,11 +170,10 @@ class Benjr(Body):
     kind = "benjr"
     cells = 1
 
-    def __init__(self, board: Board, motion: RobotMotion | None = None) -> None:
-        super().__init__(board, motion)
+    def connect(self) -> None:
         self.shield = MotorShield()
         self.shield.before_change = self.before_output_change
-        board.bus.attach(self.pins.MOTOR_SHIELD, self.shield)
+        self.board.bus.attach(self.pins.MOTOR_SHIELD, self.shield)
         self.measure_battery()
 
     def outputs(self) -> Pair:

@@ -79,52 +79,43 @@ class _Sound(msgspec.Struct):
 
 
 class _Recorder:
-    """A recorder of events and samples in a folder; without a folder it records nothing."""
+    """A recorder of events and samples in a folder, from the first sample on."""
 
-    def __init__(self, sound: _Sound, folder: Path | None, resources: ExitStack) -> None:
-        self._sound, self._folder, self._resources = sound, folder, resources
-        self._playback: Playback | None = None
-        self._out: wave.Wave_write | None = None
-
-    def begin(self) -> None:
-        if self._folder is None:
-            return
-        sound, now = self._sound, time.monotonic_ns()
-        path = self._folder / f"{now:020}-{os.getpid()}.wav"
-        raw: BinaryIO = self._resources.enter_context(path.open("wb", buffering=0))
-        self._out = self._resources.enter_context(wave.open(raw, "wb"))  # noqa: SIM115 - closed with the others
+    def __init__(self, sound: _Sound, folder: Path, resources: ExitStack) -> None:
+        now = time.monotonic_ns()
+        path = folder / f"{now:020}-{os.getpid()}.wav"
+        raw: BinaryIO = resources.enter_context(path.open("wb", buffering=0))
+        self._events = folder / _EVENTS
+        self._out = resources.enter_context(wave.open(raw, "wb"))  # noqa: SIM115 - closed with the others
         self._out.setnchannels(sound.channels)
         self._out.setsampwidth(sound.width)
         self._out.setframerate(sound.rate)
         self._out.writeframes(b"")  # the header: the file can be read from now on
         self._playback = Playback(os.getpid(), sound.file, sound.rate, sound.channels, str(path), now)
         self._write()
-
-    def add(self, chunk: bytes) -> None:
-        if self._out is not None:
-            self._out.writeframes(chunk)
+        self.add = self._out.writeframes
 
     def end(self, frames: int, *, stopped: bool) -> None:
-        if self._playback is not None:
-            self._playback.ended_ns, self._playback.stopped = time.monotonic_ns(), stopped
-            self._playback.seconds = round(frames / self._sound.rate, 4)
-            self._write()
+        self._playback.ended_ns, self._playback.stopped = time.monotonic_ns(), stopped
+        self._playback.seconds = round(frames / self._playback.rate, 4)
+        self._write()
 
     def _write(self) -> None:
-        if self._folder is not None:
-            with (self._folder / _EVENTS).open("ab", buffering=0) as file:  # one write: players share the file
-                file.write(msgspec.json.encode(self._playback) + b"\n")
+        with self._events.open("ab", buffering=0) as file:  # one write: players share the file
+            file.write(msgspec.json.encode(self._playback) + b"\n")
 
 
-def _play(sound: _Sound, recorder: _Recorder) -> bool:
-    """Play in real time until the end or a signal; False if it was stopped."""
+def _play(sound: _Sound, folder: Path | None, resources: ExitStack) -> bool:
+    """Play in real time until the end or a signal, and record it in ``folder``; False if it was stopped."""
     due, frames, stopped = 0.0, 0, False
+    recorder: _Recorder | None = None
     try:
         for chunk in sound.chunks():
             if not frames:  # the first chunk
-                recorder.begin()
+                recorder = None if folder is None else _Recorder(sound, folder, resources)
                 due = time.monotonic()
-            recorder.add(chunk)
+            if recorder is not None:
+                recorder.add(chunk)
             count = len(chunk) // (sound.channels * sound.width)
             frames += count
             due = max(due, time.monotonic() - _DELAY_LIMIT_S) + count / sound.rate  # what is later than that stays late
@@ -133,7 +124,8 @@ def _play(sound: _Sound, recorder: _Recorder) -> bool:
         stopped = True
     for number in (signal.SIGTERM, signal.SIGINT):  # else a second signal could interrupt what follows
         signal.signal(number, signal.SIG_IGN)
-    recorder.end(frames, stopped=stopped)
+    if recorder is not None:
+        recorder.end(frames, stopped=stopped)
     return not stopped
 
 
@@ -147,8 +139,7 @@ def main(arguments: list[str]) -> int:
         try:
             if folder is not None:
                 folder.mkdir(parents=True, exist_ok=True)
-            sound = _open(options, resources)
-            complete = _play(sound, _Recorder(sound, folder, resources))
+            complete = _play(_open(options, resources), folder, resources)
         except _StoppedError:
             complete = False
         except (OSError, EOFError, wave.Error) as error:

@@ -14,30 +14,37 @@ def run(kind: str, link: Path, *, trace: Path | None = None, trace_output: bool 
     end = EndSignal()
     with PtyMcu(kind, link, trace=trace, trace_output=trace_output) as mcu:
         if control:
-            threading.Thread(target=_run_commands, args=(mcu, end), name="pebble-sim control", daemon=True).start()
+            serve_commands(lambda words: command(mcu, words), end)
         print(f"{kind} is at {link}; Ctrl-C ends it", flush=True)  # noqa: T201
         end.wait()
     return 0
 
 
-def actions(mcu: PtyMcu) -> dict[str, Callable[[], None]]:
-    """Return the commands that standard input accepts."""
-    return {
+def serve_commands(execute: Callable[[list[str]], str], end: EndSignal) -> None:
+    """Execute the lines of standard input on a thread; when it closes, request the end of the program.
+
+    ``execute`` gets the words of a line, and returns what is wrong with them, or "".
+    """
+
+    def serve() -> None:
+        for line in sys.stdin:
+            if problem := execute(line.split()):
+                sys.stderr.write(f"{line.strip()!r}: {problem}\n")
+        end.set()
+
+    threading.Thread(target=serve, name="pebble-sim control", daemon=True).start()
+
+
+def command(mcu: PtyMcu, words: list[str]) -> str:
+    """Execute a command of one word; return what is wrong with it, or ""."""
+    commands: dict[str, Callable[[], None]] = {
         "unplug": mcu.unplug,
         "replug": mcu.replug,
         "reset": mcu.reset,
         "charge": lambda: mcu.charge(True),
         "discharge": lambda: mcu.charge(False),
     }
-
-
-def _run_commands(mcu: PtyMcu, end: EndSignal) -> None:
-    """Execute the lines of standard input; when it closes, request the end of the program."""
-    commands = actions(mcu)
-    for line in sys.stdin:
-        action = commands.get(line.strip())
-        if action is None:
-            sys.stderr.write(f"unknown command {line.strip()}; known: {', '.join(commands)}\n")
-        else:
-            action()
-    end.set()
+    if len(words) != 1 or words[0] not in commands:
+        return f"known commands: {', '.join(commands)}"
+    commands[words[0]]()
+    return ""

@@ -1,8 +1,8 @@
 """The physics of a robot on two driven wheels: motion and pose, hall sensors, battery."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 WHEEL_DIAMETER_MM = 61.0  # Goob's geometry; Fred's is not documented
 TRACK_MM = 130.5
@@ -27,14 +27,8 @@ class Wheels:
     track_mm: float = TRACK_MM
 
 
-class Ground(Protocol):
-    """The ground under a robot."""
-
-    def move(self, start: Pose, end: Pose) -> Pose:
-        """Return the pose that a robot reaches on its way from ``start`` to ``end``: something may stop it."""
-
-    def place(self, pose: Pose) -> None:
-        """Note that the robot was lifted and put down at ``pose``."""
+#: The ground under a robot: returns the pose that it reaches on its way between two poses, as something may stop it.
+Ground = Callable[[Pose, Pose], Pose]
 
 
 class RobotMotion:
@@ -50,9 +44,7 @@ class RobotMotion:
 
     def place(self, pose: Pose) -> None:
         """Lift the robot and put it down at ``pose``; its wheels do not notice."""
-        self.pose = pose
-        if self.ground is not None:
-            self.ground.place(pose)
+        self.pose = pose if self.ground is None else self.ground(pose, pose)
 
     def advance(self, left: float, right: float, seconds: float) -> None:
         """Drive the motors at ``left`` and ``right`` (−1..1 of full speed) for ``seconds``."""
@@ -73,7 +65,7 @@ class RobotMotion:
             math.remainder(self.pose.heading_rad + turn, math.tau),
         )
         if end != self.pose:
-            self.pose = end if self.ground is None else self.ground.move(self.pose, end)
+            self.pose = end if self.ground is None else self.ground(self.pose, end)
 
 
 def _follow(speed: float, wanted: float, seconds: float) -> tuple[float, float]:

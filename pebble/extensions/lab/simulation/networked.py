@@ -8,9 +8,9 @@ from pathlib import Path
 
 from pebble.config.security import Security
 from pebble.contract.identity import Identity
+from pebble.extensions.lab.simulation.bodies import Pair
 from pebble.extensions.lab.simulation.fleet import ConnectionReporter, Fleet, members
 from pebble.extensions.lab.simulation.trace import Trace, motors_entry
-from pebble.extensions.lab.simulation.wireless import Motors
 from pebble.runtime.signals import EndSignal
 from pebble.transports import MqttSettings
 
@@ -34,7 +34,7 @@ def run(
     """
     end, record = EndSignal(), Trace(trace)
 
-    def on_motors(now: float, motors: Motors) -> None:
+    def on_motors(now: float, motors: Pair) -> None:
         record.add(motors_entry(int(now * 1e9), motors))
 
     with Fleet(broker) as fleet:

@@ -80,7 +80,7 @@ class PtyMcu:
         self._recorder = _Recorder(self.trace, is_text=self._mcu.profile.is_text, output=trace_output)
         self._master: int | None = None  # the MCU's end of the pty; None while it is unplugged
         self._tty = ""  # the path of the host's end
-        self._host = False  # a program has the port open
+        self.host = False  # a program has the port open
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"pebble-sim {kind}", daemon=True)
 
@@ -116,7 +116,7 @@ class PtyMcu:
             if self.symlink.is_symlink() and self.symlink.readlink() == Path(self._tty):
                 self.symlink.unlink()
             os.close(self._master)
-            self._master, self._host = None, False
+            self._master, self.host = None, False
             self._recorder.event("unplugged")
 
     def replug(self) -> None:
@@ -159,11 +159,6 @@ class PtyMcu:
             self._mcu.body.advance()
             return self._mcu.motion.pose
 
-    @property
-    def host(self) -> bool:
-        """True if a program has the port open."""
-        return self._host
-
     # -- the MCU's thread
 
     def _run(self) -> None:
@@ -181,7 +176,7 @@ class PtyMcu:
 
     def _wait(self) -> None:
         """Wait for data from the host, or for the next tick."""
-        if self._host and self._master is not None:
+        if self.host and self._master is not None:
             with suppress(OSError, ValueError):  # it is unplugged meanwhile
                 select.select([self._master], [], [], self._tick_s)
         else:
@@ -198,13 +193,13 @@ class PtyMcu:
         events = poller.poll(0)
         has_data = bool(events and events[0][1] & select.POLLIN)
         hung_up = bool(events and events[0][1] & select.POLLHUP)
-        if (has_data or not hung_up) and not self._host:
-            self._host = True
+        if (has_data or not hung_up) and not self.host:
+            self.host = True
             self._recorder.event("opened")
         if has_data:
             self._receive(master)
-        elif hung_up and self._host:
-            self._host = False
+        elif hung_up and self.host:
+            self.host = False
             self._recorder.event("closed")
 
     def _receive(self, master: int) -> None:
@@ -221,7 +216,7 @@ class PtyMcu:
         if not data:
             return
         sent, began = 0, time.monotonic_ns()
-        if self._host and self._master is not None:
+        if self.host and self._master is not None:
             with suppress(OSError):  # the host's buffer is full, or it has just closed
                 sent = os.write(self._master, data)
         self.dropped += len(data) - sent

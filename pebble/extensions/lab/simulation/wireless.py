@@ -9,7 +9,7 @@ from typing import Any, Final
 from pebble.config.security import Security
 from pebble.contract.identity import Identity
 from pebble.errors import ConfigError
-from pebble.extensions.lab.simulation.bodies import body_of
+from pebble.extensions.lab.simulation.bodies import Pair, body_of
 from pebble.extensions.lab.simulation.micropython.board import Board
 from pebble.extensions.lab.simulation.micropython.clock import RealClock
 from pebble.extensions.lab.simulation.micropython.files import Files
@@ -23,8 +23,6 @@ KINDS: Final = ("minilamp", "benjr")
 _MOVING_S, _RESTING_S = 0.01, 0.05  # period of turns while sockets are idle
 _CA_FILE = "/ca.der"
 _OPEN = Security()
-
-Motors = tuple[float, float]
 
 
 class WirelessRobot:
@@ -43,7 +41,7 @@ class WirelessRobot:
         *,
         name: str = "",
         security: Security = _OPEN,
-        on_motors: Callable[[float, Motors], None] | None = None,
+        on_motors: Callable[[float, Pair], None] | None = None,
         moving_s: float = _MOVING_S,
         files: Path | None = None,
     ) -> None:
@@ -55,9 +53,9 @@ class WirelessRobot:
         self.board = Board(clock, self.network, uid, seed=secrets.randbits(64))  # other random numbers at each start
         self.board.files = Files(files)
         self.body = body_of(kind, self.board)
-        self.body.on_motors = self._moved
-        self._on_motors, self._moving_s = on_motors, moving_s
-        self._motors: Motors = (0.0, 0.0)
+        if on_motors is not None:
+            self.body.on_motors = on_motors
+        self._moving_s = moving_s
         if broker.tls is not None and broker.tls.ca_cert is not None:
             self.board.files[_CA_FILE] = _read(broker.tls.ca_cert)
         try:
@@ -76,7 +74,7 @@ class WirelessRobot:
 
     @property
     def moving(self) -> bool:
-        return any(self._motors)
+        return any(self.body.motors)
 
     @property
     def online(self) -> bool:
@@ -114,12 +112,6 @@ class WirelessRobot:
             tls = {"ca": _CA_FILE}
         login = {"username": broker.username, "password": broker.password} if broker.username is not None else {}
         return {"host": broker.host, "port": broker.port, "tls": tls, **login}
-
-    def _moved(self, now: float, motors: Motors) -> None:
-        """Note that the body's motors have changed."""
-        self._motors = motors
-        if self._on_motors is not None:
-            self._on_motors(now, motors)
 
 
 def _read(file: Path) -> bytes:

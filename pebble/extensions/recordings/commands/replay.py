@@ -22,8 +22,7 @@ from pebble.extensions.recordings.catalogue import check_name
 from pebble.extensions.recordings.commands.options import RecordingsArgument, Since, Until, period
 from pebble.extensions.recordings.commands.report import report_unread
 from pebble.extensions.recordings.library import files, problems
-from pebble.extensions.recordings.replay.pace import FASTEST, SLOWEST
-from pebble.extensions.recordings.replay.player import BusOutput, Player
+from pebble.extensions.recordings.replay.player import FASTEST, SLOWEST, BusOutput, Player
 from pebble.extensions.recordings.replay.robots import Make, ReplayedRobots
 from pebble.extensions.recordings.replay.rules import SYSTEM, Options, Rules
 from pebble.extensions.recordings.replay.source import ReplaySource

@@ -57,33 +57,23 @@ class _Export:
     def add(self, message: Recorded) -> None:
         """Add a message in Foxglove's form, or as JSON. Media have no JSON: without a form they are left out."""
         topic, payload = message.channel.topic, message.payload
-        if is_picture(payload) or payload.startswith(PBAT):
-            converted = self._media.convert(topic, payload)
-            if converted is None:
-                self.counts[LEFT_OUT] += 1
-                return
+        is_medium = is_picture(payload) or payload.startswith(PBAT)
+        converted = (self._media if is_medium else self._telemetry).convert(topic, payload)
+        stamp = time_of(payload, message.log_ns, message.publish_ns)
+        if converted is not None:
+            channel, name = self._channel(topic, converted), converted.message.DESCRIPTOR.name
+            data: bytes | None = stamped(converted.message, stamp)
         else:
-            converted = self._telemetry.convert(topic, payload)
-        if converted is None:
-            self._add_json(message)
-        else:
-            self._add(message, converted)
-
-    def _add(self, message: Recorded, converted: Converted) -> None:
-        protobuf, topic = converted.message, f"{message.channel.topic}/{converted.ending}"
-        if topic not in self._channels:
-            # 0, here and below: ``Copy`` numbers channels and messages itself.
-            schema = Schema(protobuf.DESCRIPTOR.full_name, "protobuf", self._schemas.descriptors(protobuf))
-            self._channels[topic] = Channel(0, topic, "protobuf", {}, schema)
-        stamp = time_of(message.payload, message.log_ns, message.publish_ns)
-        self._copy.add(Recorded(self._channels[topic], 0, message.log_ns, stamp, stamped(protobuf, stamp)))
-        self.counts[protobuf.DESCRIPTOR.name] += 1
-
-    def _add_json(self, message: Recorded) -> None:
-        payload, topic = as_object(message.payload), message.channel.topic
-        if payload is None:
+            channel, name, data = Channel(0, topic, JSON), JSON, None if is_medium else as_object(payload)
+        if data is None:
             self.counts[LEFT_OUT] += 1
             return
-        stamp = time_of(message.payload, message.log_ns, message.publish_ns)
-        self._copy.add(Recorded(Channel(0, topic, JSON), 0, message.log_ns, stamp, payload))
-        self.counts[JSON] += 1
+        self._copy.add(Recorded(channel, 0, message.log_ns, stamp, data))  # 0: ``Copy`` numbers them itself
+        self.counts[name] += 1
+
+    def _channel(self, topic: str, converted: Converted) -> Channel:
+        protobuf, topic = converted.message, f"{topic}/{converted.ending}"
+        if topic not in self._channels:
+            schema = Schema(protobuf.DESCRIPTOR.full_name, "protobuf", self._schemas.descriptors(protobuf))
+            self._channels[topic] = Channel(0, topic, "protobuf", {}, schema)
+        return self._channels[topic]

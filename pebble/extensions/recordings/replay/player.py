@@ -5,10 +5,10 @@ from typing import Final, Protocol
 
 from pebble.extensions.recordings.files.reader import Chooses
 from pebble.extensions.recordings.files.recorded import FOREVER_NS, Recorded
-from pebble.extensions.recordings.replay.pace import Pace
 from pebble.extensions.recordings.replay.rules import Rules, zero
 from pebble.transports import Message
 
+SLOWEST, FASTEST = 0.1, 100.0  # speeds
 _TICK_S: Final = 0.05  # at least so often the caller can act
 _NOW_S: Final = 1e-6  # less is not worth waiting for
 _RETRY_S: Final = 0.01  # after a message that was refused
@@ -91,6 +91,35 @@ class BusOutput:
         for topic in list(self._moved):
             if self._publish(zero(topic)):
                 del self._moved[topic]
+
+
+class Pace:
+    """The position in a recording that is played at a speed, from a starting point on.
+
+    Positions are in nanoseconds since 1970; ``now``, in seconds, never goes back.
+    """
+
+    def __init__(self, now: Callable[[], float], *, speed: float) -> None:
+        self._now = now
+        self.speed = min(max(speed, SLOWEST), FASTEST)
+        self.from_ns, self._since_s = 0, 0.0  # a position, and when playing went on from it
+
+    def change(self, speed: float, position_ns: int) -> None:
+        """Play at another speed, from this position."""
+        self.go_on_from(position_ns)
+        self.speed = min(max(speed, SLOWEST), FASTEST)
+
+    def go_on_from(self, position_ns: int) -> None:
+        self.from_ns, self._since_s = position_ns, self._now()
+
+    @property
+    def reached_ns(self) -> int:
+        """Return the present position, if nothing delays it."""
+        return self.from_ns + int((self._now() - self._since_s) * self.speed * 1e9)
+
+    def due_s(self, position_ns: int, now: float) -> float:
+        """Return the seconds until a position is reached; negative if it is passed."""
+        return (position_ns - self.from_ns) / 1e9 / self.speed + self._since_s - now
 
 
 class Reading:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -18,15 +18,9 @@ if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection
 
 _BINS, _FINEST_MS = 60, 0.5  # of histograms
-_LINUX_ONLY: Final = tuple(channel.metric for channel in (c.LOGS, c.MEDIA_STATUS, c.SOUNDBOARD_FILES, c.AUTONOMY_FILES))
-
-
-def _names(texts: Sequence[str]) -> str:
-    return ", ".join(f"'{text}'" for text in texts)
-
-
-def _numbers(numbers: Iterable[int]) -> str:
-    return ", ".join(map(str, sorted(numbers)))
+_LINUX_ONLY: Final = ", ".join(
+    quoted(channel.metric) for channel in (c.LOGS, c.MEDIA_STATUS, c.SOUNDBOARD_FILES, c.AUTONOMY_FILES)
+)
 
 
 def _percentile(value: str, share: float) -> str:
@@ -50,7 +44,7 @@ _FAMILY: Final = f"""CASE
 _SECONDS: Final = f"""
     CREATE OR REPLACE TEMP TABLE seconds AS
     SELECT epoch_ns(ts) // 1000000000 AS second, {_FAMILY} AS family, count(*) AS messages,
-           sum(size)::BIGINT AS bytes, bool_or(activity IN ({_numbers(SESSION)})) AS used
+           sum(size)::BIGINT AS bytes, bool_or(activity BETWEEN {SESSION[0]} AND {SESSION[-1]}) AS used
     FROM messages GROUP BY ALL
 """
 _HEARTBEATS: Final = f"""
@@ -130,7 +124,7 @@ _LATENCIES: Final = f"""
     FROM heartbeats WHERE {_PLAUSIBLE} GROUP BY bin
 """
 _ABOUT: Final = f"""
-    SELECT bool_or(direction = '{c.OUTGOING}' AND (metric IN ({_names(_LINUX_ONLY)}) OR medium IS NOT NULL)),
+    SELECT bool_or(direction = '{c.OUTGOING}' AND (metric IN ({_LINUX_ONLY}) OR medium IS NOT NULL)),
            bool_or(metric = '{c.ONLINE.metric}'), bool_or(metric IN ('{c.ONLINE.metric}', '{c.HEARTBEAT.metric}'))
     FROM indexed
 """

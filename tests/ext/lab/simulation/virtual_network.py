@@ -1,4 +1,8 @@
-"""A network in memory and virtual time for one simulated board: name server, time server and broker, and all faults."""
+"""A network in memory and virtual time for one simulated board: name server, time server, MQTT broker, and all faults.
+
+The broker is enough for one robot and an operator, with mosquitto's limits: QoS 0 and 1, retained messages, wills,
+keepalive, at most 20 messages in flight to a client. Protocol violations of clients are recorded in ``violations``.
+"""
 
 from __future__ import annotations
 
@@ -6,24 +10,18 @@ import errno
 import socket
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 from pebble.extensions.lab.simulation.micropython.answers import name_answer, time_answer
 from pebble.extensions.lab.simulation.micropython.clock import Clock
 from pebble.extensions.lab.simulation.micropython.faults import failure
-from pebble.extensions.lab.simulation.micropython.modules.sockets import (
-    MAX_SOCKETS,
-    Address,
-    BoardSocket,
-    numeric,
-    socket_module,
-)
+from pebble.extensions.lab.simulation.micropython.modules.sockets import Address, BoardSocket, HostNetwork, numeric
 from pebble.extensions.lab.simulation.micropython.modules.streams import POLLERR, POLLHUP, POLLIN, POLLOUT, Stream
-from pebble.extensions.lab.simulation.micropython.modules.tls import ssl_module
-from pebble.extensions.lab.simulation.micropython.modules.wlan import ADDRESS, Platform, Radio, network_module
-from tests.ext.lab.simulation.virtual_broker import Command, Session, VirtualBroker
+from pebble.extensions.lab.simulation.micropython.modules.wlan import ADDRESS, Platform
+from pebble.transports.topics import matches
+from tests.kit import mqtt_bytes
 
 WINDOW = 5760  # bytes the board takes before its firmware reads: 4 segments, as lwIP has on both ports
 
@@ -53,7 +51,7 @@ class Wire:
         self._marks: deque[tuple[int, Command]] = deque()  # of the bytes that the board received
         self._in = self._out = 0  # bytes of the inbox so far
         self._session: Session | None = None
-        self._up: deque[tuple[float, bytes]] = deque()
+        self.up: deque[tuple[float, bytes]] = deque()  # writes that have not reached the other end
         self._down: deque[tuple[float, bytes, Command | None]] = deque()
         self._ends_as: State | None = None  # once the broker hung up
         self._retry_s = _FIRST_RETRY_S
@@ -73,11 +71,6 @@ class Wire:
         closed = self.state is State.CLOSED and (self._session is None or self._ends_as is not None)
         return closed or self.state in (State.FINISHED, State.RESET, State.REFUSED)
 
-    @property
-    def unacknowledged(self) -> int:
-        """Writes of the board that have not reached the other end."""
-        return len(self._up)
-
     # -- the board's end
 
     def take(self, size: int) -> bytes:
@@ -90,10 +83,10 @@ class Wire:
 
     def put(self, data: bytes) -> int:
         """Store what fits into the board's send buffer; return how many bytes that were."""
-        room = WINDOW - sum(len(piece) for _, piece in self._up)
+        room = WINDOW - sum(len(piece) for _, piece in self.up)
         data = data[: max(0, room)]
         if data:
-            self._up.append((self._due(self._up[-1][0] if self._up else 0.0), data))
+            self.up.append((self._due(self.up[-1][0] if self.up else 0.0), data))
         return len(data)
 
     def close(self) -> None:
@@ -130,13 +123,13 @@ class Wire:
             self.state = State.REFUSED
 
     def _carry_up(self) -> None:
-        while self._up and self._up[0][0] <= self._now() and self._session is not None:
-            _, data = self._up.popleft()
+        while self.up and self.up[0][0] <= self._now() and self._session is not None:
+            _, data = self.up.popleft()
             if self._ends_as is None:
                 self._session.feed(data)
             elif self.state is State.OPEN:
                 self.state = State.RESET  # the broker is not running
-        if self.state is State.CLOSED and not self._up and self._session is not None:
+        if self.state is State.CLOSED and not self.up and self._session is not None:
             session, self._session = self._session, None
             if self._ends_as is None:
                 session.close()
@@ -180,8 +173,8 @@ class Conditions:
     cut: Callable[[int], int] = field(default=lambda size: size)
 
 
-class VirtualNetwork:
-    """``modules()`` is for the board. ``step`` delivers what is due, and is called at every use of a socket.
+class VirtualNetwork(HostNetwork):
+    """The board's network, without this machine. ``step`` delivers what is due; every use of a socket calls it.
 
     ``arrivals`` are the operator's commands that reached the board, with the time their last byte did; ``reads`` are
     those that its firmware has read.
@@ -195,34 +188,18 @@ class VirtualNetwork:
         platform: Platform = "esp32",
         hosts: Mapping[str, str | Sequence[str]] = HOSTS,
     ) -> None:
-        self.clock, self.broker = clock, broker
-        self.radio = Radio(clock.now, platform)
+        super().__init__(clock, platform=platform)
+        self.broker, self.hosts = broker, hosts
         self.conditions = Conditions()
         self.arrivals: list[tuple[float, Command]] = []
         self.reads: list[Command] = []
-        self.open: list[VirtualTcp | VirtualUdp] = []
-        self.hosts: Mapping[str, str | Sequence[str]] = hosts
         self._wires: list[Wire] = []
-
-    def modules(self) -> dict[str, Any]:
-        """What a board has after power on or a reset: no socket, a radio that is off."""
-        self.power_off()
-        return {
-            "network": network_module(self.radio),
-            "socket": socket_module(self._socket),
-            "ssl": ssl_module(),
-        }
-
-    def power_off(self) -> None:
-        for sock in list(self.open):
-            sock.close()
-        self.radio.activate(False)
 
     def passable(self) -> bool:
         return self.radio.connected and not self.conditions.hole
 
     @property
-    def unread(self) -> bool:
+    def has_unread(self) -> bool:
         """Whether bytes have reached the board that its firmware has not taken yet."""
         return any(wire.inbox for wire in self._wires)
 
@@ -238,8 +215,7 @@ class VirtualNetwork:
         self._wires.append(wire)
         return wire
 
-    def ask(self, place: Address, data: bytes) -> bytes | None:
-        """What a server at ``place`` answers to a datagram."""
+    def answer(self, data: bytes, place: Address) -> bytes | None:
         if place in NAME_SERVERS:
             known = {} if self.conditions.dns == "no such name" else self.hosts
             return self._spoilt(self.conditions.dns, name_answer(data, known.get))
@@ -253,12 +229,8 @@ class VirtualNetwork:
             return None
         return bytes(byte ^ 0xA5 for byte in answer) if how == "nonsense" else answer
 
-    def _socket(self, kind: int) -> VirtualTcp | VirtualUdp:
-        if len(self.open) >= MAX_SOCKETS:
-            raise OSError(errno.ENFILE, "too many sockets: one is not closed")
-        made = VirtualTcp(self) if kind == socket.SOCK_STREAM else VirtualUdp(self)
-        self.open.append(made)
-        return made
+    def make(self, kind: int) -> BoardSocket:
+        return VirtualTcp(self) if kind == socket.SOCK_STREAM else VirtualUdp(self)
 
 
 class VirtualTcp(BoardSocket, Stream):
@@ -299,7 +271,7 @@ class VirtualTcp(BoardSocket, Stream):
         self._check(wire)
         if wire.state is State.CONNECTING and self._network.radio.platform == "esp32":
             raise failure(errno.EINPROGRESS)  # the ESP8266's lwIP takes early bytes
-        if self._network.radio.platform == "esp8266" and wire.unacknowledged >= _WRITES_8266:
+        if self._network.radio.platform == "esp8266" and len(wire.up) >= _WRITES_8266:
             self._network.clock.sleep(_STUCK_S)
             return None
         return wire.put(data) or None
@@ -327,18 +299,325 @@ class VirtualUdp(BoardSocket):
         self._need_wifi()
         network = self._network
         received = network.passable() and not network.conditions.mute
-        answer = network.ask(numeric(place), bytes(data)) if received else None
+        answer = network.answer(bytes(data), numeric(place)) if received else None
         if answer is not None:
             self._answers.append((network.clock.now() + 2 * network.conditions.latency_s(), answer, place))
         return len(data)
 
     def recvfrom(self, size: int) -> tuple[bytes, Address]:
-        if not self.ready(POLLIN):
+        network = self._network
+        if not (network.passable() and self._answers and self._answers[0][0] <= network.clock.now()):
             raise failure(errno.EAGAIN)
         _, data, place = self._answers.popleft()
         return data[:size], place
 
-    def ready(self, mask: int) -> int:
-        """What poll() of the board reports."""
-        there = self._network.passable() and self._answers and self._answers[0][0] <= self._network.clock.now()
-        return ((POLLIN if there else 0) | POLLOUT) & mask
+
+# -- the broker
+
+CONNECT, CONNACK, PUBLISH, PUBACK, SUBSCRIBE, SUBACK, PINGREQ, PINGRESP, DISCONNECT = 1, 2, 3, 4, 8, 9, 12, 13, 14
+
+_CLIENT_FLAGS = {CONNECT: 0, PUBACK: 0, SUBSCRIBE: 2, PINGREQ: 0, DISCONNECT: 0}  # the low half of the first byte
+
+
+class MqttError(Exception):
+    """A client broke the protocol: a broker closes its connection."""
+
+
+@dataclass(frozen=True, slots=True)
+class Publish:
+    topic: str
+    payload: bytes
+    qos: int = 0
+    retain: bool = False
+    packet_id: int = 0
+
+
+class Body:
+    """What is left of a packet's body."""
+
+    def __init__(self, data: bytes) -> None:
+        self.left = data
+
+    def take(self, size: int) -> bytes:
+        if len(self.left) < size:
+            raise MqttError("a packet that is shorter than it says")
+        taken, self.left = self.left[:size], self.left[size:]
+        return taken
+
+    def number(self) -> int:
+        return int.from_bytes(self.take(2), "big")
+
+    def data(self) -> bytes:
+        return self.take(self.number())
+
+    def text(self) -> str:
+        return self.data().decode()
+
+
+def split(buffer: bytearray) -> tuple[int, int, Body] | None:
+    """Take the first packet out of ``buffer``: its type, flags and body; None while it is not complete."""
+    sizes = bytes(buffer[1:5])
+    end = next((at for at, byte in enumerate(sizes, 1) if not byte & 0x80), 0)  # of the bytes of its length
+    if not end:
+        if len(sizes) == 4:
+            raise MqttError("a length of more than four bytes")
+        return None
+    whole = 1 + end + sum((byte & 0x7F) << 7 * place for place, byte in enumerate(sizes[:end]))
+    if len(buffer) < whole:
+        return None
+    kind, flags, body = buffer[0] >> 4, buffer[0] & 0x0F, bytes(buffer[1 + end : whole])
+    del buffer[:whole]
+    if kind != PUBLISH and _CLIENT_FLAGS.get(kind) != flags:
+        raise MqttError(f"no packet of a client: type {kind}, flags {flags}")
+    return kind, flags, Body(body)
+
+
+def packet(kind: int, body: bytes = b"") -> bytes:
+    return mqtt_bytes.packet(kind << 4, body)
+
+
+_IN_FLIGHT = 20  # mosquitto's max_inflight_messages
+_QUEUED = 1000  # mosquitto's max_queued_messages
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A message of an operator, whether it is retained, and when it left the broker's queue."""
+
+    payload: bytes
+    retained: bool
+    topic: str
+    left_at: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """What a client published."""
+
+    at: float
+    message: Publish
+
+
+class VirtualBroker:
+    """Connections are made by ``accept``, bytes come by Session.feed, time by ``step``."""
+
+    def __init__(self, now: Callable[[], float]) -> None:
+        self.now = now
+        self.running = True
+        self.frozen = False
+        self.received: list[Received] = []
+        self.retained: dict[str, Publish] = {}
+        self.violations: list[str] = []
+        self.refused: set[str] = set()  # topics that no client may subscribe to
+        self._sessions: list[Session] = []
+        self._backlog: deque[tuple[Publish, Command]] = deque()
+
+    def kill(self) -> None:
+        """Kill the broker: every connection is reset, and all state is lost."""
+        self.running = self.frozen = False
+        self._backlog.clear()
+        sessions, self._sessions = self._sessions, []
+        self.retained.clear()
+        for session in sessions:
+            session.line.hang_up()
+
+    def start(self) -> None:
+        self.running = True
+
+    def accept(self, line: Wire) -> Session:
+        session = Session(self, line)
+        self._sessions.append(session)
+        return session
+
+    def drop_all(self) -> None:
+        """Disconnect every client."""
+        for session in list(self._sessions):
+            session.close()
+
+    def freeze(self) -> None:
+        """Suspend the broker with its connections open."""
+        self.frozen = True
+
+    def thaw(self) -> None:
+        """Resume, and process what has arrived meanwhile, the operator's messages first."""
+        self.frozen = False
+        while self._backlog:
+            self._route(*self._backlog.popleft())
+        self.step()
+
+    def publish(self, topic: str, payload: bytes, *, qos: int = 0, retain: bool = False) -> None:
+        """Publish as the operator."""
+        self.route(Publish(topic, payload, qos, retain))
+
+    def route(self, message: Publish) -> None:
+        command = Command(message.payload, retained=False, topic=message.topic)
+        if self.frozen:
+            self._backlog.append((message, command))
+        elif self.running:
+            self._route(message, command)
+
+    def _route(self, message: Publish, command: Command) -> None:
+        if message.retain and message.payload:
+            self.retained[message.topic] = message
+        elif message.retain:
+            self.retained.pop(message.topic, None)
+        for session in self._sessions:
+            session.offer(replace(message, retain=False), command)
+
+    def step(self) -> None:
+        """Disconnect clients whose keepalive has expired."""
+        if not self.frozen:
+            for session in list(self._sessions):
+                session.step()
+
+    def taken_over(self, by: Session) -> None:
+        """Close an older connection with the same client id."""
+        for session in list(self._sessions):
+            if session is not by and session.client_id == by.client_id:
+                session.close()
+
+    def forget(self, session: Session) -> None:
+        if session in self._sessions:
+            self._sessions.remove(session)
+
+    @property
+    def queued(self) -> int:
+        """Number of messages that wait for acknowledgements of others."""
+        return sum(len(session.queue) for session in self._sessions)
+
+
+class Session:
+    """One connection of a client."""
+
+    def __init__(self, broker: VirtualBroker, line: Wire) -> None:
+        self.line, self.client_id = line, ""
+        self._broker = broker
+        self._buffer = bytearray()
+        self._will: Publish | None = None
+        self._wanted: dict[str, int] = {}
+        self._patterns: list[str] = []  # those with wildcards
+        self._limit_s = 10.0  # for the CONNECT; then the keepalive
+        self._received_at = broker.now()
+        self._number = 0
+        self._in_flight: set[int] = set()
+        self.queue: deque[tuple[Publish, Command]] = deque()
+
+    def feed(self, data: bytes) -> None:
+        """Process bytes of the client."""
+        self._buffer += data
+        self._received_at = self._broker.now()
+        try:
+            while not self._broker.frozen and (found := split(self._buffer)):
+                self._handle(*found)
+        except (MqttError, UnicodeDecodeError) as error:
+            self._broker.violations.append(f"{type(error).__name__}: {error}")
+            self.close()
+
+    def step(self) -> None:
+        if self._buffer:
+            self.feed(b"")  # what came while the broker was frozen
+        if self._broker.now() - self._received_at > self._limit_s:
+            self.close()
+
+    def close(self) -> None:
+        """Close the connection without a DISCONNECT: the will is published."""
+        self._broker.forget(self)
+        self.line.hang_up()
+        if self._will is not None:
+            will, self._will = self._will, None
+            self._publish(will)
+
+    def offer(self, message: Publish, command: Command) -> None:
+        granted = self._granted(message.topic)
+        if granted is None:
+            return
+        message = replace(message, qos=min(granted, message.qos))
+        if message.qos and len(self._in_flight) >= _IN_FLIGHT:
+            if len(self.queue) < _QUEUED:
+                self.queue.append((message, command))
+        else:
+            self._deliver(message, command)
+
+    def _granted(self, topic: str) -> int | None:
+        exact = self._wanted.get(topic)
+        if exact is not None or not self._patterns:
+            return exact
+        return max((self._wanted[one] for one in self._patterns if matches(one, topic)), default=None)
+
+    def _deliver(self, message: Publish, command: Command) -> None:
+        if message.qos:
+            self._number = self._number % 65535 + 1
+            self._in_flight.add(self._number)
+            message = replace(message, packet_id=self._number)
+        data = mqtt_bytes.publish(message.topic, message.payload, message.qos, message.packet_id, retain=message.retain)
+        self.line.send(data, replace(command, left_at=self._broker.now()))
+
+    def _handle(self, kind: int, flags: int, body: Body) -> None:
+        if (kind == CONNECT) == bool(self.client_id):
+            raise MqttError(f"a packet of type {kind} {'after' if self.client_id else 'before'} CONNECT")
+        if kind == CONNECT:
+            self._connect(body)
+        elif kind == PUBLISH:
+            self._published(flags, body)
+        elif kind == SUBSCRIBE:
+            self._subscribe(body)
+        elif kind == PINGREQ:
+            self.line.send(packet(PINGRESP))
+        elif kind == PUBACK:
+            self._acknowledged(body.number())
+        else:
+            self._will = None
+            self.close()
+
+    def _connect(self, body: Body) -> None:
+        name, level, flags, keepalive_s = body.text(), body.take(1)[0], body.take(1)[0], body.number()
+        if (name, level) != ("MQTT", 4) or flags & 1:
+            raise MqttError(f"not MQTT 3.1.1: {name} {level}")
+        client_id, will = body.text(), None
+        if flags & 4:
+            will = Publish(body.text(), body.data(), flags >> 3 & 3, bool(flags & 0x20))
+        for flag in (0x80, 0x40):  # a user name, a password
+            if flags & flag:
+                body.data()
+        if body.left:
+            raise MqttError("a CONNECT with something behind it")
+        self.client_id, self._will = client_id, will
+        self._limit_s = 1.5 * keepalive_s or float("inf")
+        self._broker.taken_over(by=self)
+        self.line.send(packet(CONNACK, bytes(2)))
+
+    def _published(self, flags: int, body: Body) -> None:
+        qos, topic = flags >> 1 & 3, body.text()
+        number = body.take(2) if qos else b""
+        if qos > 1 or number == bytes(2) or not topic or "+" in topic or "#" in topic:
+            raise MqttError(f"a publish to {topic!r} with QoS {qos} and number {number!r}")
+        self._publish(Publish(topic, body.left, qos, bool(flags & 1)))
+        if qos:
+            self.line.send(packet(PUBACK, number))
+
+    def _publish(self, message: Publish) -> None:
+        self._broker.received.append(Received(self._broker.now(), message))
+        self._broker.route(message)
+
+    def _subscribe(self, body: Body) -> None:
+        number, wanted = body.take(2), list[tuple[str, int]]()
+        while body.left:
+            wanted.append((body.text(), body.take(1)[0]))
+        if number == bytes(2) or not wanted or any(qos > 2 for _, qos in wanted):
+            raise MqttError("a SUBSCRIBE without number or topics")
+        refused = self._broker.refused
+        self._patterns += [topic for topic, _ in wanted if "+" in topic and topic not in refused]
+        codes = bytes(0x80 if topic in refused else min(qos, 1) for topic, qos in wanted)
+        self._wanted.update((topic, qos) for topic, qos in wanted if topic not in refused)
+        self.line.send(packet(SUBACK, number + codes))
+        for topic, qos in wanted:
+            for retained in [one for one in self._broker.retained.values() if matches(topic, one.topic)]:
+                copy = replace(retained, qos=min(qos, retained.qos), retain=True)
+                self._deliver(copy, Command(retained.payload, retained=True, topic=retained.topic))
+
+    def _acknowledged(self, number: int) -> None:
+        if number not in self._in_flight:
+            raise MqttError(f"a PUBACK for {number}, which was not sent")
+        self._in_flight.discard(number)
+        while self.queue and len(self._in_flight) < _IN_FLIGHT:
+            self._deliver(*self.queue.popleft())

@@ -31,8 +31,7 @@ from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.transports import Message, QoS
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.ext.page.media import robots
-from tests.ext.recordings.messages import DRIVE, MEDIA, contents
-from tests.ext.recordings.playing import FRED
+from tests.ext.recordings.playing import DRIVE, FRED, MEDIA, contents
 from tests.support import until
 
 BASE = "pebble/robots/goob"

@@ -17,7 +17,7 @@ from pebble.extensions.recordings.catalogue import look_at
 from pebble.extensions.recordings.files.reader import RecordingFile
 from pebble.extensions.recordings.files.recorded import UNNAMED, RecordingError
 from pebble.extensions.recordings.files.rewrite import rewrite
-from tests.ext.recordings.messages import DRIVE, MEDIA, START_NS, STEP_NS, contents, read, write
+from tests.ext.recordings.playing import DRIVE, MEDIA, STEP_NS, THEN_NS, contents, read, write_random
 from tests.kit.npm import package
 from tests.support import cases
 
@@ -65,7 +65,7 @@ class TestWhole:
     @pytest.mark.parametrize("count", [2000, 0])
     def test_other_readers_read_it(self, tmp_path: Path, count: int) -> None:
         path = tmp_path / "a.mcap"
-        written = write(path, count)
+        written = write_random(path, count)
         assert [by_mcap(path), *by_mcap_core([path])] == [Counted(count, count, count)] * 2
         found, damage = read(path)
         assert (found, damage.report()) == (written, "")
@@ -73,8 +73,8 @@ class TestWhole:
     @pytest.mark.parametrize("finish", [True, False])
     def test_a_period_and_some_channels_are_read(self, tmp_path: Path, finish: bool) -> None:
         path = tmp_path / "a.mcap"
-        written = write(path, finish=finish)
-        since, until = START_NS + 500 * STEP_NS, START_NS + 700 * STEP_NS
+        written = write_random(path, finish=finish)
+        since, until = THEN_NS + 500 * STEP_NS, THEN_NS + 700 * STEP_NS
         assert contents(path, since_ns=since, until_ns=until) == written[500:700]
         topic = "pebble/robots/r3/outgoing/t3"
         chosen = contents(path, chooses=lambda channel: channel.topic == topic)
@@ -83,7 +83,7 @@ class TestWhole:
     def test_one_that_is_written_is_read_so_far_as_it_is(self, tmp_path: Path) -> None:
         """Byte by byte: the last chunk, and the indexes behind it, are often there only in part."""
         source, path = tmp_path / "a.mcap", tmp_path / "growing.mcap.active"
-        written = write(source, 300, each=50, finish=False)
+        written = write_random(source, 300, each=50, finish=False)
         data, lengths = source.read_bytes(), list[int]()
         path.write_bytes(data[:40])
         with RecordingFile(path) as file:
@@ -146,7 +146,7 @@ class TestDamaged:
     ) -> None:
         rng, path = random.Random(f"{damage.__name__}{finished}"), tmp_path / "a.mcap"
         mended: dict[Path, Counted] = {}
-        written = write(path, finish=finished)
+        written = write_random(path, finish=finished)
         whole = path.read_bytes()
         for number in range(2 * TIMES):
             raw, path = bytearray(whole), tmp_path / f"{number}.mcap"
@@ -166,7 +166,7 @@ class TestDamaged:
 
     def test_one_bit_costs_a_chunk_at_most(self, tmp_path: Path) -> None:
         rng, path = random.Random(1), tmp_path / "a.mcap"
-        written = write(path)
+        written = write_random(path)
         whole = path.read_bytes()
         for _ in range(25 * TIMES):
             raw = bytearray(whole)
@@ -179,7 +179,7 @@ class TestDamaged:
     def test_bits_of_what_has_no_checksum(self, tmp_path: Path) -> None:
         """A bit of opcodes and lengths of each record: a wrong one must not hide the others."""
         rng, path, step = random.Random(3), tmp_path / "a.mcap", cases(27, 1)
-        written = write(path, 600, finish=False)
+        written = write_random(path, 600, finish=False)
         whole = path.read_bytes()
         for begin in _records(whole):
             for at in range(begin + rng.randrange(step), begin + 9, step):
@@ -212,7 +212,7 @@ def _records(raw: bytes) -> list[int]:
 
 def test_without_some_messages(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    written = write(path)
+    written = write_random(path)
     path.chmod(0o640)
     os.utime(path, (1_000_000_000, 1_000_000_000))
     made = rewrite(path, path, keeps=lambda message: "/r3/" not in message.channel.topic)
@@ -226,7 +226,7 @@ def test_without_some_messages(tmp_path: Path) -> None:
 
 def test_what_is_missing_stays_known(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    write(path, finish=False)
+    write_random(path, finish=False)
     raw = bytearray(path.read_bytes())
     zero_a_page(raw, random.Random(3))
     path.write_bytes(raw)
@@ -241,7 +241,7 @@ def test_what_is_missing_stays_known(tmp_path: Path) -> None:
 
 def test_more_topics_than_a_file_can_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, copy = tmp_path / "a.mcap", tmp_path / "copy.mcap"
-    write(path)
+    write_random(path)
     monkeypatch.setattr("pebble.extensions.recordings.files.rewrite.MOST_CHANNELS", 19)
     with pytest.raises(RecordingError, match="one file has no room for more topics"):
         rewrite(path, copy)

@@ -14,8 +14,7 @@ import pytest
 from pebble.extensions.recordings.files.rewrite import rewrite
 from pebble.extensions.recordings.stamps import stamp_ns
 from tests.commands.command_line import Run, program
-from tests.ext.recordings import messages
-from tests.ext.recordings.playing import FRED, GOOB, Line, demo, js, ms, write
+from tests.ext.recordings.playing import FRED, GOOB, Line, demo, js, ms, write, write_random
 from tests.ext.recordings.recorder.test_record import Reference
 from tests.support import WAIT_S, Broker, beside, until
 
@@ -171,7 +170,7 @@ def test_errors_are_one_line(tmp_path: Path, run: Run, arguments: tuple[str, ...
 
 def test_what_damage_has_taken_is_counted(tmp_path: Path, at: tuple[str, str], run: Run) -> None:
     path, mended = tmp_path / "x.mcap", tmp_path / "mended.mcap"
-    messages.write(path, 400, channels=3)
+    write_random(path, 400, channels=3)
     data = bytearray(path.read_bytes())
     middle = len(data) // 2
     data[middle : middle + 20] = bytes(20)

@@ -42,8 +42,7 @@ from pebble.extensions.recordings.traffic.results import (
 )
 from pebble.extensions.recordings.traffic.sources import sources
 from pebble.extensions.recordings.traffic.tables import tables, write_csv
-from tests.ext.recordings.messages import DRIVE, MEDIA
-from tests.ext.recordings.playing import FRED, GOOB, THEN_NS, Line, js, ms, write
+from tests.ext.recordings.playing import DRIVE, FRED, GOOB, MEDIA, THEN_NS, Line, js, ms, write
 from tests.support import refused
 
 duckdb = pytest.importorskip("duckdb")

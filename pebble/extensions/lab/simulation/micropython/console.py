@@ -22,7 +22,7 @@ class Console:
         self.reading = True
         self.lost = 0  # bytes
         self._pause, self._wait = pause, wait  # the board's: for some seconds, and until there is input
-        self.typed = bytearray()
+        self.typed = bytearray()  # what the firmware has not read yet
         self._output = bytearray()
         self.is_interrupted = False
 
@@ -45,11 +45,6 @@ class Console:
         output = bytes(self._output)
         self._output.clear()
         return output
-
-    @property
-    def unread(self) -> int:
-        """Bytes that the firmware has not read yet."""
-        return len(self.typed)
 
     def check_interrupt(self) -> None:
         """Raise KeyboardInterrupt if Ctrl-C was received. Called wherever the firmware checks its input."""

@@ -18,16 +18,9 @@ from pebble.extensions.lab.simulation.world.walls import Floor, motion_of
 from pebble.extensions.lab.simulation.world.world_file import LONGEST_EXPOSURE_MS, LONGEST_LATENCY_MS, World
 
 STEP_S: Final = 0.005  # one turn of the firmware's loop
+WIDTH, HEIGHT, FPS = 640, 480, 15.0  # of pictures
 _STEPS_PER_SAMPLE = round(PERIOD_S / STEP_S)
 _SAMPLES = round((LONGEST_LATENCY_MS + LONGEST_EXPOSURE_MS) / 1000 / PERIOD_S) + 2
-
-
-class CameraMode(NamedTuple):
-    """The size of pictures in pixels, and their number per second."""
-
-    width: int = 640
-    height: int = 480
-    fps: float = 15.0
 
 
 class Picture(NamedTuple):
@@ -50,11 +43,10 @@ class LockstepWorld:
                 goob.drive(x=0.0, z=0.3)
     """
 
-    def __init__(self, world: World, camera: CameraMode | None = None) -> None:
+    def __init__(self, world: World) -> None:
         self._steps = 0
-        self.floor = Floor(world)
-        mode = camera or CameraMode()
-        self.robots = {name: LockstepRobot(world, name, self.floor, mode) for name in world.robots}
+        floor, tracks = Floor(world), dict[str, Track]()
+        self.robots = {name: LockstepRobot(world, name, floor, tracks) for name in world.robots}
         self._sample()
 
     def now(self) -> float:
@@ -77,24 +69,23 @@ class LockstepWorld:
     def _sample(self) -> None:
         for robot in self.robots.values():
             robot.sample()
-        tracks = {name: robot.track for name, robot in self.robots.items()}
-        for robot in self.robots.values():
-            robot.tracks = tracks
 
 
 class LockstepRobot:
     """A robot of a LockstepWorld, which calls ``tick`` and ``sample``: its serial line, camera and true state."""
 
-    def __init__(self, world: World, name: str, floor: Floor, camera: CameraMode) -> None:
+    def __init__(self, world: World, name: str, floor: Floor, tracks: dict[str, Track]) -> None:
+        """Put the robot at its start. ``tracks``: those of all robots, to which its own is added."""
         self.name = name
         self.motion = motion_of(world, name, floor)
         self.mcu = SimulatedMcu(world.robots[name].kind, 0.0, motion=self.motion)
-        self.tracks: dict[str, Track] = {}  # of all robots, by name; the world sets it
-        self._world, self._camera = world, camera
+        self._world = world
         self._renderer: Renderer | None = None  # made for the first picture: not every test has OpenCV to load
         self._now = 0.0
         self._output = b""  # of the MCU, not yet read
         self._samples: deque[Sample] = deque(maxlen=_SAMPLES)
+        self._tracks = tracks
+        tracks[name] = Track(self._samples)
         self._newest_picture = 0  # the number of the picture that was returned last
 
     @property
@@ -128,15 +119,15 @@ class LockstepRobot:
 
     def picture(self) -> Picture | None:
         """Return the newest picture, unless it was returned before. It is rendered only when asked for."""
-        number = int(self._now * self._camera.fps + 1e-6)  # rounding may leave it just below a whole number
+        number = int(self._now * FPS + 1e-6)  # rounding may leave it just below a whole number
         if number == self._newest_picture:
             return None
         self._newest_picture = number
-        at = number / self._camera.fps - self._world.camera.latency_ms / 1000
-        pixels = np.empty((self._camera.height, self._camera.width, 3), np.uint8)
+        at = number / FPS - self._world.camera.latency_ms / 1000
+        pixels = np.empty((HEIGHT, WIDTH, 3), np.uint8)
         if self._renderer is None:
-            self._renderer = Renderer(self._world, self.name, self._camera.width, self._camera.height)
-        self._renderer.render(self.tracks, round(at * 1e9), pixels)
+            self._renderer = Renderer(self._world, self.name, WIDTH, HEIGHT)
+        self._renderer.render(self._tracks, round(at * 1e9), pixels)
         return Picture(pixels, at)
 
     # -- for the world
@@ -147,7 +138,3 @@ class LockstepRobot:
 
     def sample(self) -> None:
         self._samples.append(Sample(round(self._now * 1e9), self.pose))
-
-    @property
-    def track(self) -> Track:
-        return Track(list(self._samples))

@@ -2,9 +2,7 @@
 
 import math
 import os
-import sys
 import tempfile
-import threading
 import time
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -13,7 +11,7 @@ from typing import Any, Final
 import msgspec
 
 from pebble.errors import DeviceError
-from pebble.extensions.lab.simulation.mcu import actions
+from pebble.extensions.lab.simulation.mcu import command, serve_commands
 from pebble.extensions.lab.simulation.motion import Pose
 from pebble.extensions.lab.simulation.pty import PtyMcu
 from pebble.extensions.lab.simulation.world.pose_page import PERIOD_S, PosePage, page_path
@@ -57,7 +55,7 @@ def run(file: Path, folder: Path | None = None, *, trace: Path | None = None, co
                 imus[name] = stack.enter_context(PtyMcu("goob_imu", imu_port_path(folder, name), motion=motion))
         print(_introduction(path, mcus, imus), flush=True)  # noqa: T201
         if control:
-            threading.Thread(target=_run_commands, args=(mcus, end), name="pebble-world control", daemon=True).start()
+            serve_commands(lambda words: _command(mcus, words), end)
         _publish_poses(page, mcus, end)
     return 0
 
@@ -117,27 +115,16 @@ def _serial(mcu: PtyMcu) -> dict[str, Any]:
     return {"serial": {"port": str(mcu.symlink)}}
 
 
-def _run_commands(mcus: Mcus, end: EndSignal) -> None:
-    """Execute the lines of standard input; when it closes, request the end of the program."""
-    for line in sys.stdin:
-        if problem := _command(mcus, line.split()):
-            sys.stderr.write(f"{line.strip()!r}: {problem}\n")
-    end.set()
-
-
 def _command(mcus: Mcus, words: list[str]) -> str:
     """Execute one line of standard input; return what is wrong with it, or ""."""
     if len(words) < 2 or words[0] not in mcus:
         return f"begin with a robot ({', '.join(mcus)}) and a command"
-    mcu, command, arguments = mcus[words[0]], words[1], words[2:]
-    commands = actions(mcu)
-    if command in commands and not arguments:
-        commands[command]()
-        return ""
-    if command != "place":
-        return f"known commands: {', '.join(commands)}, place X Y DEGREES"
+    mcu = mcus[words[0]]
+    if words[1] != "place":
+        problem = command(mcu, words[1:])
+        return f"{problem}, place X Y DEGREES" if problem else ""
     try:
-        x, y, degrees = map(float, arguments)
+        x, y, degrees = map(float, words[2:])
         mcu.place(Pose(x * 1000, y * 1000, math.remainder(math.radians(degrees), math.tau)))
     except ValueError:
         return "place needs three numbers: metres, metres, degrees"

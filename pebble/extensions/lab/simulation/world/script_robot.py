@@ -15,7 +15,7 @@ from pebble.config import parse
 from pebble.contract import DRIVE, Channel
 from pebble.contract.payloads import Drive, EstopState
 from pebble.errors import PebbleError
-from pebble.extensions.lab.simulation.world.lockstep import STEP_S, LockstepRobot, LockstepWorld
+from pebble.extensions.lab.simulation.world.lockstep import STEP_S, LockstepWorld
 from pebble.extensions.lab.simulation.world.world_file import read_world
 from pebble.extensions.scripts.script import EXIT_ENDED, Robot, Stopped
 from pebble.extensions.scripts.script.drive_sender import DriveSender
@@ -67,7 +67,8 @@ class SimulatedRobot(Robot):
         self.published: list[tuple[Channel, Any]] = []
         self._addresses = Addresses(self.config)
         self._last_values: dict[Channel, Callable[[], Any]] = {}  # by publish_at_end
-        self._model, self._body = model, self.world.robots[name]
+        self.body = self.world.robots[name]  # its true pose, and its motor board
+        self._model = model
         self._sender = DriveSender(1, self._drive)
         self._driven_at = -math.inf  # when the last command was sent; infinite once the watchdog has stopped the wheels
         self._end_at = math.inf
@@ -96,13 +97,8 @@ class SimulatedRobot(Robot):
         """
         for placed in self._model.tags:
             if placed.id == tag:
-                return math.hypot(placed.x - self._body.pose.x, placed.y - self._body.pose.y)
+                return math.hypot(placed.x - self.body.pose.x, placed.y - self.body.pose.y)
         raise PebbleError(f"there is no tag {tag} in this world")
-
-    @property
-    def body(self) -> LockstepRobot:
-        """The robot in the world: its true pose, and its motor board."""
-        return self._body
 
     def receive(self, channel: Channel, value: Any) -> None:
         """Receive a message of another program. A drive command without a source is a person's."""
@@ -120,7 +116,7 @@ class SimulatedRobot(Robot):
         for state in (free, replace(free, latched=True, count=1, by=by, since=1)):
             self._sender.owners({"serial": state}, self.world.now())
         self._latched = True
-        self._body.drive(0.0, 0.0)
+        self.body.drive(0.0, 0.0)
 
     # -- for scripts
 
@@ -129,13 +125,13 @@ class SimulatedRobot(Robot):
         del width, views, timeout  # without effect here
         while True:
             self._pass_step()
-            picture = self._body.picture()
+            picture = self.body.picture()
             if picture is not None:
                 yield picture.pixels
 
     def picture(self, max_age: float = 0.5) -> Image | None:
         self._pass_step()
-        picture = self._body.picture()
+        picture = self.body.picture()
         if picture is not None:
             self._picture = (picture.pixels, picture.at)
         if self._picture is None:
@@ -203,10 +199,10 @@ class SimulatedRobot(Robot):
         self._sender.tick(now)
         if now - self._driven_at > _WATCHDOG_S:
             self._driven_at = math.inf
-            self._body.drive(0.0, 0.0)
+            self.body.drive(0.0, 0.0)
 
     def _drive(self, command: Drive) -> bool:
         if not self._latched:
             self._driven_at = self.world.now()
-            self._body.drive(command.x, command.z)
+            self.body.drive(command.x, command.z)
         return True

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import threading
+from functools import partial
 
 from pebble.extensions.lab.simulation.motion import Pose, RobotMotion, Wheels
 from pebble.extensions.lab.simulation.world.world_file import World
@@ -25,10 +26,6 @@ class Floor:
         self._radius_mm = {name: place.radius_m * 1000 for name, place in world.robots.items()}
         self._poses = {name: start_pose(world, name) for name in world.robots}
 
-    def mover(self, name: str) -> Mover:
-        """Return the view of the floor by which this robot moves."""
-        return Mover(self, name)
-
     def move(self, name: str, start: Pose, end: Pose) -> Pose:
         """Move a robot as far as the way is free; return its pose then, with the heading of ``end``."""
         with self._lock:
@@ -38,10 +35,6 @@ class Floor:
             x_mm, y_mm = _between(start, end, part)
             self._poses[name] = Pose(x_mm, y_mm, end.heading_rad)
             return self._poses[name]
-
-    def place(self, name: str, pose: Pose) -> None:
-        with self._lock:
-            self._poses[name] = pose
 
     def _free_part(self, name: str, start: Pose, end: Pose, start_clearance_mm: float) -> float:
         """Return how much of the move is free, 0 to 1, by halving. ``start_clearance_mm``: at its start, see _free."""
@@ -71,19 +64,6 @@ class Floor:
         return min((*walls, *others), default=math.inf)
 
 
-class Mover:
-    """A view of the floor for one robot: it moves that robot, up to walls and other robots."""
-
-    def __init__(self, floor: Floor, name: str) -> None:
-        self._floor, self._name = floor, name
-
-    def move(self, start: Pose, end: Pose) -> Pose:
-        return self._floor.move(self._name, start, end)
-
-    def place(self, pose: Pose) -> None:
-        self._floor.place(self._name, pose)
-
-
 def start_pose(world: World, name: str) -> Pose:
     place = world.robots[name]
     return Pose(place.x * 1000, place.y * 1000, math.remainder(math.radians(place.heading_deg), math.tau))
@@ -93,7 +73,7 @@ def motion_of(world: World, name: str, floor: Floor) -> RobotMotion:
     """Return the motion of a robot, on its wheels, from the place where it starts."""
     place = world.robots[name]
     wheels = Wheels(place.left_wheel_mm, place.right_wheel_mm, place.track_mm)
-    return RobotMotion(start_pose(world, name), floor.mover(name), wheels)
+    return RobotMotion(start_pose(world, name), partial(floor.move, name), wheels)
 
 
 def _between(start: Pose, end: Pose, part: float) -> tuple[float, float]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import cache
 from typing import Any
 
 import cv2
@@ -16,6 +15,9 @@ from pebble.extensions.lab.simulation.world.surfaces import Image
 from pebble.extensions.lab.simulation.world.world_file import World, parse_world
 
 CLEAR = {"noise": 0.0, "blur": 0.0}
+_PARAMETERS = cv2.aruco.DetectorParameters()
+_PARAMETERS.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+_DETECTOR = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_25h9), _PARAMETERS)
 
 
 def world_of(**keys: Any) -> World:
@@ -23,28 +25,18 @@ def world_of(**keys: Any) -> World:
     return parse_world({"robots": {"goob": {"x": 0.0, "y": 0.0}}, **keys})
 
 
-def at_rest(**poses: tuple[float, float, float]) -> dict[str, Track]:
-    """Tracks of robots that stand there: x, y, heading."""
-    return {name: Track([Sample(0, RobotPose(*pose))]) for name, pose in poses.items()}
-
-
-def seen(world: World, ns: int = 0, size: tuple[int, int] = (640, 480), **poses: tuple[float, float, float]) -> Image:
+def seen(world: World, size: tuple[int, int] = (640, 480), **poses: tuple[float, float, float]) -> Image:
     """What goob sees; it stands at the origin unless told otherwise."""
     picture = np.empty((size[1], size[0], 3), np.uint8)
-    Renderer(world, "goob", *size).render(at_rest(**{"goob": (0.0, 0.0, 0.0), **poses}), ns, picture)
+    stands = {"goob": (0.0, 0.0, 0.0), **poses}
+    tracks = {name: Track([Sample(0, RobotPose(*pose))]) for name, pose in stands.items()}
+    Renderer(world, "goob", *size).render(tracks, 0, picture)
     return picture
 
 
-@cache
-def _detector(family: str) -> Any:
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{family}")), parameters)
-
-
-def tags_in(picture: Image, family: str = "APRILTAG_25h9") -> dict[int, NDArray[np.float64]]:
+def tags_in(picture: Image) -> dict[int, NDArray[np.float64]]:
     """The corners of each tag, (4, 2), clockwise from the upper left, by its id."""
-    corners, ids, _ = _detector(family).detectMarkers(picture)
+    corners, ids, _ = _DETECTOR.detectMarkers(picture)
     numbers = [] if ids is None else ids.ravel().tolist()
     return {number: np.asarray(found[0], np.float64) for number, found in zip(numbers, corners, strict=True)}
 

@@ -31,29 +31,8 @@ MAX_SOCKETS = 5  # TCP connections of the ESP8266's lwIP; the ESP32 has a few mo
 _CONSTANTS = {name: int(getattr(socket, name)) for name in ("AF_INET", "SOCK_STREAM", "SOCK_DGRAM")}
 
 
-class Servers:
-    """The name server and the time server. A name has the addresses that this machine's resolver returns."""
-
-    def __init__(self) -> None:
-        self._addresses: dict[str, list[str]] = {TIME_HOST: [_TIME_ADDRESS]}  # by name
-
-    def answer(self, request: bytes, place: Address) -> bytes | None:
-        """Return the answer to a packet for ``place``; None if nothing answers there."""
-        if place == (_TIME_ADDRESS, 123):
-            return time_answer(request, time.time())
-        return name_answer(request, self._resolve) if place in _NAME_SERVERS else None
-
-    def _resolve(self, name: str) -> list[str] | None:
-        """Return the addresses of a name; None if there is none at present."""
-        if name not in self._addresses:
-            with suppress(OSError):
-                answers = socket.getaddrinfo(name, None, socket.AF_INET, socket.SOCK_STREAM)
-                self._addresses[name] = list(dict.fromkeys(str(address[4][0]) for address in answers))[:_MOST]
-        return self._addresses.get(name)
-
-
 class HostNetwork:
-    """The network of one board.
+    """The network of one board, with a name server, which asks this machine's resolver, and a time server.
 
     The program that runs the board watches ``new_sockets``. If ``unread`` it runs the next turn at once: the last read
     was as long as asked, so there may be more.
@@ -66,7 +45,7 @@ class HostNetwork:
         self.unread = False
         self.problem = ""  # of the last connection, as text
         self.open: list[BoardSocket] = []  # all that the firmware has not closed
-        self.servers = Servers()
+        self._addresses: dict[str, list[str]] = {TIME_HOST: [_TIME_ADDRESS]}  # by name
 
     def modules(self) -> dict[str, Any]:
         """Close all sockets and turn the radio off, as each boot does; return the modules for the board."""
@@ -83,12 +62,29 @@ class HostNetwork:
             sock.close()
         self.radio.activate(False)
 
-    def _socket(self, kind: int) -> HostTcp | HostUdp:
+    def answer(self, request: bytes, place: Address) -> bytes | None:
+        """Return a server's answer to a packet for ``place``; None if nothing answers there."""
+        if place == (_TIME_ADDRESS, 123):
+            return time_answer(request, time.time())
+        return name_answer(request, self._resolve) if place in _NAME_SERVERS else None
+
+    def _resolve(self, name: str) -> list[str] | None:
+        """Return the addresses of a name; None if there is none at present."""
+        if name not in self._addresses:
+            with suppress(OSError):
+                answers = socket.getaddrinfo(name, None, socket.AF_INET, socket.SOCK_STREAM)
+                self._addresses[name] = list(dict.fromkeys(str(address[4][0]) for address in answers))[:_MOST]
+        return self._addresses.get(name)
+
+    def make(self, kind: int) -> BoardSocket:
+        """Return a new socket of this kind."""
+        return HostTcp(self) if kind == socket.SOCK_STREAM else HostUdp(self)
+
+    def _socket(self, kind: int) -> BoardSocket:
         if len(self.open) >= MAX_SOCKETS:
             raise OSError(errno.ENFILE, "too many sockets: one is not closed")
-        opened = HostTcp(self) if kind == socket.SOCK_STREAM else HostUdp(self)
-        self.open.append(opened)
-        return opened
+        self.open.append(self.make(kind))
+        return self.open[-1]
 
 
 def socket_module(make: Any) -> SimpleNamespace:
@@ -210,7 +206,7 @@ class HostUdp(BoardSocket):
 
     def sendto(self, data: bytes, address: Address) -> int:
         self._need_wifi()
-        if (answer := self._network.servers.answer(bytes(data), numeric(address))) is not None:
+        if (answer := self._network.answer(bytes(data), numeric(address))) is not None:
             self._answers.append((answer, address))
         return len(data)
 
