@@ -16,9 +16,10 @@ from pebble.extensions.operator.client import forms
 from pebble.extensions.operator.client.connection import Target, connected, put_account_into_topics, target_of, wait_for
 from pebble.extensions.operator.client.driveable import doubt_of
 from pebble.extensions.operator.client.names import id_of
-from pebble.extensions.operator.client.scripts import RobotScripts, options_of
+from pebble.extensions.operator.client.scripts import RobotScripts
 from pebble.extensions.operator.commands.options import RobotArgument
 from pebble.extensions.operator.commands.target import with_target
+from pebble.extensions.scripts.script.options import usage
 from pebble.transports import Transport
 
 _HELP = """Programs that move a robot by themselves; docs/ext/scripts.md explains them.
@@ -60,7 +61,7 @@ def list_(robot: RobotArgument, *, target: Target) -> int:
             label = str(entry.get("label") or file)
             _print(file if label == file else f"{file}: {label}")
             for setting in forms.listed(entry.get("configs")):
-                _print(f"    {_option(setting)}")
+                _print(f"    {usage(setting)}")
         if scripts.status is not None:
             _print_status(scripts.status, scripts)
     return 0
@@ -182,25 +183,6 @@ def _print_status(status: AutonomyStatus, scripts: RobotScripts) -> None:
         _print("no script runs")
     if status.error:
         _print(f"error: {status.error}")
-
-
-def _option(setting: forms.Setting) -> str:
-    """Return an option's line, such as ``--tag-id INT  Tag ID (default: 13)``."""
-    names: dict[bool | None, str] = {}  # the first option for each value of a flag; None: for other settings
-    for option, value in options_of(setting):
-        names.setdefault(value, option)
-    usage = f"{names.get(None)} {setting.type.upper()}"
-    if setting.type == "bool":
-        usage = f"[{names[True]} | {names[False]}]"
-    notes = []
-    if setting.options:
-        notes.append(", ".join(map(str, setting.options)))
-    if setting.min is not None:
-        notes.append(f"min {setting.min}")
-    if setting.max is not None:
-        notes.append(f"max {setting.max}")
-    notes.append("required" if setting.required else f"default: {setting.default}")
-    return f"{usage:32}  {setting.label or setting.key} ({'; '.join(notes)})"
 
 
 def _print(line: str) -> None:
