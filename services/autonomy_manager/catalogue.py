@@ -31,8 +31,7 @@ from pebble.services.autonomy_manager.describe import (
     read_manifest,
     stamp,
 )
-from pebble.services.autonomy_manager.environment import environment, local_login
-from pebble.services.autonomy_manager.interpreter import interpreter
+from pebble.services.autonomy_manager.environment import environment, interpreter, local_login
 from pebble.services.autonomy_manager.script import Dependency, Script
 
 MAX_SCRIPTS = 256  # that are listed
@@ -181,7 +180,7 @@ class Catalogue:
         return answer
 
     def _describe(self, folder: Path, entry: Path, section: ScriptSection, *, asks: bool) -> _Answer:
-        """Return a script's description: by its files, and if it is one of ours, by its own answer.
+        """Return a script's description: one of ours is asked, any other has the one in its `script.json`.
 
         ``asks`` False: do not run it now; the description says if it has still to be asked.
         """
@@ -207,13 +206,11 @@ class Catalogue:
             return _Answer(described, ours, problem)
         if not asks:  # it is ours, and is asked later
             return _Answer(described, ours, problem, asked=False)
-        command = self._command(folder, entry, section, described, ours=True)
         try:
-            answer = ask(command, folder, environment(section.env))
-            return _Answer(_merged(described, answer), ours, problem, drives=answer.drives)
+            answer = ask(self._command(folder, entry, section, described, ours=True), folder, environment(section.env))
         except DescribeError as error:
-            is_broken = isinstance(error, BrokenScriptError)
-            return _Answer(described, ours, problem=str(error), broken=is_broken)
+            return _Answer(described, ours, problem=str(error), broken=isinstance(error, BrokenScriptError))
+        return _Answer(replace(answer, command=[]), ours, problem, drives=answer.drives)
 
     def _command(
         self, folder: Path, entry: Path, section: ScriptSection, described: Description, *, ours: bool
@@ -290,22 +287,6 @@ def _inside(root: Path) -> list[Path]:
         return [folder for folder in root.iterdir() if folder.is_dir()]
     except OSError:  # most often there is none
         return []
-
-
-def _merged(manifest: Description, answer: Description) -> Description:
-    """Return a manifest's description, with its missing fields taken from the script's own answer.
-
-    The manifest has no ``command``, else the script is not asked. ``drives`` the caller takes from the answer itself.
-    """
-    keys = {setting.key for setting in manifest.configs}
-    added = [setting for setting in answer.configs if setting.key not in keys]
-    return Description(
-        label=manifest.label or answer.label,
-        summary=manifest.summary or answer.summary,
-        main=manifest.main or answer.main,
-        configs=[*manifest.configs, *added][:MAX_SETTINGS],
-        dependencies=manifest.dependencies or answer.dependencies,
-    )
 
 
 def _dependencies(name: str, section: ScriptSection, described: Description) -> tuple[Dependency, ...]:

@@ -154,12 +154,6 @@ class Node:
         for publication in self._publications.values():
             publication.remove_all("another node has this name")
 
-    def published(self) -> list[list[str]]:
-        return [[topic, publication.form.kind] for topic, publication in self._publications.items()]
-
-    def subscribed(self) -> list[list[str]]:
-        return [[topic, subscription.form.kind] for topic, subscription in self._subscriptions.items()]
-
     def _run_api(self) -> None:
         self._api.serve_forever(poll_interval=0.1)
 

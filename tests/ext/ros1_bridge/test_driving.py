@@ -203,8 +203,6 @@ def test_a_subscriber_that_is_not_connected_is_told_again(ros: World) -> None:
     node, told = node_of(ros), []
 
     class Deaf:
-        master = ros.uri
-
         def publishers_are(self, topic: str, uris: list[str]) -> None:
             told.extend(uri for uri in uris if topic == TOPIC)
 

@@ -24,8 +24,7 @@ from pebble.services.autonomy_manager.describe import (
     is_ours,
     read_manifest,
 )
-from pebble.services.autonomy_manager.environment import environment
-from pebble.services.autonomy_manager.interpreter import interpreter, lacking
+from pebble.services.autonomy_manager.environment import environment, interpreter, lacking
 from pebble.services.autonomy_manager.script import Script
 from tests.support import gone, until
 
