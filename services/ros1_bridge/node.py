@@ -26,7 +26,6 @@ CHECK_S = 1.0  # how often the registration is checked
 REVIVE_S = 2.0  # a subscriber that the master lists, and that is not connected, is told again so often
 GREETING_S = 2.0  # so long a new connection may take to say what it wants
 _MOST_GREETINGS = 32  # connections at once that have not said yet what they want; more are closed
-_MOST_CALLS_WAITING = 256  # calls of other nodes that wait to be made; more are made at the next check
 _QUIET_S, _PROBE_S, _PROBES = 10, 5, 3  # a publisher of whose machine nothing is heard is given up after 25 s
 
 
@@ -74,7 +73,7 @@ class Node:
         self._revived = 0  # how often a lost subscriber was told
         self._ends = threading.Event()
         self._threads: list[threading.Thread] = []
-        self._calls: queue.Queue[Callable[[], None]] = queue.Queue(_MOST_CALLS_WAITING)
+        self._calls: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # of other nodes, to be made
         self._jobs: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # of the thread of sockets
         self._greetings: dict[Subscriber, float] = {}  # connections without a request yet, and when they were made
         self._select = selectors.DefaultSelector()
@@ -259,11 +258,7 @@ class Node:
 
     def _connect_soon(self, subscription: Subscription, source: Source) -> None:
         source.asked = True
-        try:
-            self._calls.put_nowait(lambda: self._connect(subscription, source))
-        except queue.Full:
-            source.asked = False
-            self._refuse("waiting calls", "calls of other nodes that waited")
+        self._calls.put(lambda: self._connect(subscription, source))
 
     def _attempt_call(self, job: Callable[[], None]) -> None:
         try:

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from pebble.errors import PebbleError
-from pebble.extensions.calibrate.wheels import Wanted, calibrate, check
+from pebble.extensions.calibrate.wheels import Person, Wanted, calibrate, check
 from pebble.extensions.scripts.perception.odometry import Calibration, OdometrySettings
 from pebble.extensions.scripts.script import Robot, Stopped
 from pebble.extensions.scripts.script.program import run_for
@@ -23,19 +23,6 @@ _Config = Annotated[
 _Tag = Annotated[int, typer.Option(help="The tag's id.", min=0)]
 _Size = Annotated[float, typer.Option(help="Edge of the tag's black square, in metres.", min=0.01, max=2)]
 _NOTHING = "nothing was written"
-
-
-class _Terminal:
-    """A terminal that shows lines to a person, and reads the answers."""
-
-    def tell(self, line: str) -> None:
-        typer.echo(line)
-
-    def ask(self, question: str) -> str:
-        try:
-            return input(question)
-        except EOFError:
-            raise PebbleError("a person has to answer: run it in a terminal") from None
 
 
 def wheels(
@@ -60,7 +47,7 @@ def wheels(
     wanted = Wanted(length_m=length, straights=straights, spins=spins, speed_m_s=speed, expected=expected)
     check(wanted)
     results: list[Calibration] = []
-    _run(config, lambda robot: results.append(calibrate(robot, _Terminal(), wanted)))
+    _run(config, lambda robot: results.append(calibrate(robot, Person(), wanted)))
     (result,) = results
     left, right = expected.step_mm
     for name, value, expected_mm in (
@@ -112,7 +99,7 @@ def _calibrate_camera(config: Path, pictures: Any, tag: int, size: float, *, sti
     from pebble.extensions.scripts.perception.camera_model import CALIBRATION
     from pebble.extensions.scripts.perception.tags import FAMILY, TagFinder
 
-    corners, shape = collect(pictures, TagFinder(size), tag, _Terminal(), still=still)
+    corners, shape = collect(pictures, TagFinder(size), tag, Person(), still=still)
     lens = solve(corners, shape, size)
     path = config.parent / CALIBRATION
     save(path, lens, tag, size, FAMILY)

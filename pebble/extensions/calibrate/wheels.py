@@ -4,8 +4,9 @@ import math
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
+import typer
 from msgspec import Struct, json
 
 from pebble.errors import PebbleError
@@ -32,14 +33,18 @@ class Wanted(Struct, frozen=True, kw_only=True):
     expected: OdometrySettings = OdometrySettings()
 
 
-class Person(Protocol):
+class Person:
     """The person at the terminal."""
 
     def tell(self, line: str) -> None:
-        """Show a line."""
+        typer.echo(line)
 
     def ask(self, question: str) -> str:
-        """Return the answer that the person types."""
+        """Return the answer that the person types. Raises PebbleError if there is no terminal."""
+        try:
+            return input(question)
+        except EOFError:
+            raise PebbleError("a person has to answer: run it in a terminal") from None
 
 
 class _Movement(NamedTuple):

@@ -18,7 +18,7 @@ import pytest
 from pebble.contract import DRIVE, MOTOR_POWER, TOUCH_SENSORS
 from pebble.contract.payloads import Drive, TouchSensors
 from pebble.errors import PebbleError
-from pebble.extensions.calibrate.wheels import Wanted, calibrate, check
+from pebble.extensions.calibrate.wheels import Person, Wanted, calibrate, check
 from pebble.extensions.lab.simulation.motion import FULL_SPEED_MM_S, Wheels
 from pebble.extensions.lab.simulation.world.script_robot import SimulatedRobot
 from tests.ext.scripts.perception.test_odometry import powers, touches
@@ -61,7 +61,7 @@ class Measured(SimulatedRobot):
         return super()._drive(command)
 
 
-class Measurer:
+class Measurer(Person):
     """A person who puts the robot on the line before each run and measures after it, with a tape's and an eye's errors.
 
     ``slips`` are what is typed wrongly: millimetres added to the way, by the number of the straight.
