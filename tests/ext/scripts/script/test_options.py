@@ -76,7 +76,8 @@ def test_a_command_line(arguments: str, key: str, value: object) -> None:
     ("arguments", "problem"),
     [
         (["--tag-id", "x"], "--tag-id of run.py: tag_id must be a whole number"),
-        (["--tag", "3"], "--tag is no option of run.py: "),
+        (["--tag", "3"], "--tag is no option of run.py: --tag-size-m, --tag-id, "),
+        (["--tag-id"], "--tag-id needs a value"),
         (["--describe"], "--describe goes alone"),
         (["--config"], "run.py: which robot? Add its config file, for example: --config goob.json (see --help)\n"),
         (None, "run.py: --tag-size-m is missing (see --help)\n"),
@@ -131,6 +132,8 @@ def test_an_option_may_have_another_name_than_its_key() -> None:
     given, path = parse(Renamed, ["--marker-size", "0.5", *config, "--tuned"], "run.py", "")
     assert (given.tag_size_m, given.use_state, path) == (0.5, True, Path("goob.json"))
     assert parse(Renamed, config, "run.py", "")[0].tag_size_m == 0.25
+    by_key = parse(Renamed, [*config, "--tag-size-m=0.5", "--use-state"], "run.py", "")[0]
+    assert (by_key.tag_size_m, by_key.use_state) == (0.5, True)
 
 
 def test_help_lists_all_options(capsys: pytest.CaptureFixture[str]) -> None:
