@@ -1,8 +1,11 @@
 """``pebble script``: writes a new script, and lists, starts and stops those of a robot."""
 
+import re
+import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.resources import files
 from pathlib import Path
 from typing import Annotated
 
@@ -20,6 +23,7 @@ from pebble.extensions.operator.client.scripts import RobotScripts
 from pebble.extensions.operator.commands.options import RobotArgument
 from pebble.extensions.operator.commands.target import with_target
 from pebble.extensions.scripts.script.options import usage
+from pebble.runtime.as_owner import as_owner
 from pebble.transports import Transport
 
 _HELP = """Programs that move a robot by themselves; docs/ext/scripts.md explains them.
@@ -30,6 +34,7 @@ _HELP = """Programs that move a robot by themselves; docs/ext/scripts.md explain
     pebble script start goob.json follow --tag-id 7
     pebble script stop goob.json
 """
+_is_name = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,62}").fullmatch
 _FIRST_SECOND_S = 1.0  # most mistakes in a script end it within that
 _SAME_ERROR_S = 1.0  # an error that was there before the command is the answer to it, too, if it stays
 
@@ -45,10 +50,30 @@ def new(
         cd follow
         python -m pytest
     """
-    from pebble.extensions.scripts.commands.new import write
-
-    for path in write(name, folder):
-        typer.echo(path)
+    if not _is_name(name):
+        raise PebbleError(f"{name!r}: a script's name is letters, digits, - and _, beginning with a letter")
+    target = folder / name
+    try:
+        if (alike := _alike(target)) is not None:
+            raise PebbleError(f"{alike} exists already: choose another name, or another --folder")
+        with as_owner(folder):
+            target.mkdir(parents=True)
+    except OSError as error:
+        raise PebbleError(f"{target}: {error.strerror}") from None
+    world = Path(tempfile.gettempdir(), "pebble-world-room")
+    #: With absolute paths, so that `pebble up` works in every folder.
+    robot = _starter("goob.json").replace("{folder}", str(target.absolute())).replace("{world}", str(world))
+    texts = {
+        "run.py": _starter("run.py.txt"),
+        f"test_{name.replace('-', '_')}.py": _starter("test_run.py.txt"),
+        "room.json": files("pebble.extensions.lab.simulation.world").joinpath("room.json").read_text(encoding="utf-8"),
+        "goob.json": robot,
+        "pytest.ini": _starter("pytest.ini"),
+    }
+    for file, text in texts.items():
+        with as_owner(target):
+            (target / file).write_text(text, encoding="utf-8")
+        typer.echo(target / file)
 
 
 @with_target()
@@ -130,6 +155,17 @@ def register(app: typer.Typer) -> None:
     group.command("start", context_settings={"allow_extra_args": True, "ignore_unknown_options": True})(start)
     group.command("stop")(stop)
     app.add_typer(group, name="script")
+
+
+def _alike(target: Path) -> Path | None:
+    """Return an existing path that differs only in case, which many file systems ignore; else None."""
+    if not target.parent.is_dir():
+        return None
+    return next((path for path in target.parent.iterdir() if path.name.lower() == target.name.lower()), None)
+
+
+def _starter(file: str) -> str:
+    return files("pebble.extensions.scripts.commands").joinpath("starter", file).read_text(encoding="utf-8")
 
 
 @contextmanager

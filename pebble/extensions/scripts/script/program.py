@@ -52,7 +52,7 @@ def run(
         _describe(words, options, main_options, needs or {}, drives=drives)
         return
     about = _documentation(main) or label or name
-    chosen, config = parse(options or _NoOptions, sys.argv[1:], Path(sys.argv[0]).name, about)
+    chosen, config = parse(options or msgspec.Struct, sys.argv[1:], Path(sys.argv[0]).name, about)
     set_up_logging("INFO")
     sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
     try:
@@ -131,10 +131,6 @@ def _describe(
     if not drives:
         description["drives"] = False
     sys.stdout.write(msgspec.json.encode(description).decode() + "\n")
-
-
-class _NoOptions(msgspec.Struct):
-    """The options of a script that has none."""
 
 
 class _Program:
