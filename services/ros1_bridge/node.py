@@ -241,10 +241,8 @@ class Node:
     def _tell(self, topic: str, node: str, publishers: list[str]) -> None:
         uri = self._uri_of(node)
         others = filter(None, [self._uri_of(name) for name in publishers if name != self.name])
-        path = (
-            f"{next(self._revivals)}/"  # rospy ignores an address that it believes to be connected to; any path is ours
-        )
-        call(uri, "publisherUpdate", "/master", topic, [*others, f"{self.uri}{path}"])
+        # rospy ignores an address that it believes to be connected to, and any path is ours
+        call(uri, "publisherUpdate", "/master", topic, [*others, f"{self.uri}{next(self._revivals)}/"])
         log.info("%s: told %s again that this node publishes it", topic, node)
 
     def _connect_soon(self, subscription: Subscription, source: Source) -> None:
