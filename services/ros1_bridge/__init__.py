@@ -12,7 +12,7 @@ EXTENSION = Extension(
     programs=f"{_CONFIG}:programs",
     offers=f"{_CONFIG}:offers",
     facts=f"{_CONFIG}:facts",
-    checks=f"{_CONFIG}:checks",
+    checks="pebble.services.ros1_bridge.checks:checks",
     motors={"ros1": "ros1_bridge"},
     page="docs/ext/ros1.md",
 )

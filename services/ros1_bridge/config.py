@@ -8,7 +8,6 @@ from urllib.parse import urlsplit
 from msgspec import UNSET, Meta
 from msgspec.structs import replace
 
-from pebble.check_result import CheckResult, failed, ok, warn
 from pebble.config import Config
 from pebble.config.hosts import is_loopback
 from pebble.config.problems import Path
@@ -16,7 +15,6 @@ from pebble.config.reader import Reader, Rule
 from pebble.config.types import BY_CONTRACT, EXACT, Host, Section, ServiceSection, doc
 from pebble.contract.capabilities import CapabilitiesValue, TelemetryOffer
 from pebble.extension import Facts, Program, Stage
-from pebble.services.ros1_bridge.wire import RosError
 
 NONE = "none"
 
@@ -258,24 +256,3 @@ def _facts(section: Ros1) -> Iterator[str]:
         yield "no lock: other programs of ROS drive it while it is stopped"
     else:
         yield f"a stop locks {section.ros.estop_topic}"
-
-
-def checks(config: Config) -> Iterator[CheckResult]:
-    """Yield the checks of `pebble doctor`: the master answers, and some base listens to commands."""
-    section = config.section(Ros1)
-    if not section.enabled:
-        return
-    from pebble.services.ros1_bridge.xmlrpc_api import call
-
-    master, topic = section.master(), "/" + section.ros.cmd_vel_topic.strip("/")
-    try:
-        _, subscribers, _ = call(master, "getSystemState", "/pebble_doctor")
-    except (RosError, ValueError) as error:
-        yield failed(
-            f"the ROS master does not answer: {error}", "start roscore, or set services.ros1_bridge.ros.master_uri"
-        )
-        return
-    if section.drives and topic not in {name for name, _ in subscribers}:
-        yield warn(f"nobody subscribes to {topic}", "start the base, or set services.ros1_bridge.ros.cmd_vel_topic")
-        return
-    yield ok(f"the ROS master answers: {master}")

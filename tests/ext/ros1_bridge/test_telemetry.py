@@ -24,7 +24,8 @@ from pebble.errors import ConfigError
 from pebble.extension import programs_of
 from pebble.extensions.checks.conform.motion import moves_until
 from pebble.services.ros1_bridge import messages, publication
-from pebble.services.ros1_bridge.config import Ros1, checks
+from pebble.services.ros1_bridge.checks import checks
+from pebble.services.ros1_bridge.config import Ros1
 from pebble.services.ros1_bridge.messages import Form
 from pebble.services.ros1_bridge.publication import Publication, Subscriber
 from pebble.services.ros1_bridge.telemetry import Telemetry
