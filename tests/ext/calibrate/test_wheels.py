@@ -11,7 +11,6 @@ import threading
 from collections.abc import Callable
 from contextlib import closing, nullcontext
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -33,7 +32,7 @@ ROOM = {"x_min": -0.5, "x_max": 2.4, "y_min": -2.0, "y_max": 2.0}
 class Measured(SimulatedRobot):
     """A robot that publishes its hall sensors. ``at_step`` is called at each step of the clock."""
 
-    def __init__(self, folder: Path, wheels: Wheels = TRUE, *, noise: random.Random) -> None:
+    def __init__(self, folder: Path, wheels: Wheels, *, noise: random.Random) -> None:
         sizes = {
             "left_wheel_mm": wheels.left_diameter_mm,
             "right_wheel_mm": wheels.right_diameter_mm,
@@ -67,9 +66,9 @@ class Measurer(Person):
     ``slips`` are what is typed wrongly: millimetres added to the way, by the number of the straight.
     """
 
-    def __init__(self, robot: Measured, noise: random.Random, slips: dict[int, float] | None = None) -> None:
+    def __init__(self, robot: Measured, noise: random.Random, slips: dict[int, float]) -> None:
         self.told: list[str] = []
-        self._robot, self._noise, self._slips = robot, noise, slips or {}
+        self._robot, self._noise, self._slips = robot, noise, slips
         self._straights = 0
         self._began = robot.body.pose
         self._turned = 0.0
@@ -89,19 +88,25 @@ class Measurer(Person):
             return f"{math.degrees(past) + gauss(0, 2):.0f}"
         end, self._straights = robot.body.pose, self._straights + 1
         along = abs(end.x - self._began.x) * 1000 + gauss(0, 2) + self._slips.pop(self._straights, 0.0)
-        beside = f" {end.y * 1000 + gauss(0, 3):.0f}" if "left of it" in question else ""
-        return f"{along:.0f}{beside}"
+        return f"{along:.0f} {end.y * 1000 + gauss(0, 3):.0f}"
 
 
-def measure(folder: Path, seed: int = 0, wanted: Wanted | None = None, **options: Any) -> tuple[Measured, Measurer]:
-    """Run a whole calibration, or as much as is possible; ``at_step(robot)`` at each step of the clock."""
+def measure(
+    folder: Path,
+    wanted: Wanted,
+    *,
+    seed: int = 0,
+    wheels: Wheels = TRUE,
+    at_step: Callable[[Measured], object] = lambda _: None,
+    slips: dict[int, float] | None = None,
+) -> list[str]:
+    """Run a whole calibration, or as much as is possible; return what the person was told."""
     noise = random.Random(seed)
-    at_step, slips = options.pop("at_step", lambda _: None), options.pop("slips", None)
-    robot = Measured(folder, noise=noise, **options)
-    person = Measurer(robot, noise, slips)
+    robot = Measured(folder, wheels, noise=noise)
+    person = Measurer(robot, noise, slips or {})
     robot.at_step = lambda: at_step(robot)
-    robot.run(lambda robot: calibrate(robot, person, wanted or Wanted(), robot.world.now), seconds=900)
-    return robot, person
+    robot.run(lambda robot: calibrate(robot, person, wanted, robot.world.now), seconds=900)
+    return person.told
 
 
 QUICK = Wanted(length_m=0.3, straights=4, spins=2)
@@ -120,7 +125,7 @@ def test_wheels_1_percent_and_a_track_3_percent_off_are_found(seed: int, tmp_pat
     signs = random.Random(seed)
     left, right, track = (1 + signs.choice((-1, 1)) * off for off in (0.01, 0.01, 0.03))
     true = Wheels(61.0 * left, 61.0 * right, 130.5 * track)
-    measure(tmp_path, seed, wheels=true)
+    measure(tmp_path, Wanted(), seed=seed, wheels=true)
     *steps, track = off_percent(tmp_path, true)
     assert max(map(abs, steps)) < 0.3
     assert abs(track) < 0.5
@@ -156,7 +161,7 @@ def test_what_ends_a_leg_writes_nothing(tmp_path: Path, trouble: Callable[[Measu
 
     robots: list[Measured] = []
     with pytest.raises(PebbleError, match=f"1 of 6, straight there: {said}"):
-        measure(tmp_path, wanted=QUICK, at_step=lambda r: (robots.append(r), at_step(r)))
+        measure(tmp_path, QUICK, at_step=lambda r: (robots.append(r), at_step(r)))
     assert not (tmp_path / "odometry.json").exists()
     robots[0].world.run(0.5)
     assert robots[0].body.motion.left_mm_s == 0
@@ -177,7 +182,7 @@ def test_stop_in_any_leg_brings_it_to_rest_and_nothing_is_written(leg: int, tmp_
 
     before_it_drove = pytest.raises(PebbleError, match="it is not obeyed: the robot is stopped by a person")
     with before_it_drove if leg == 0 else nullcontext():
-        measure(tmp_path, wanted=QUICK, at_step=at_step)
+        measure(tmp_path, QUICK, at_step=at_step)
     ((robot, at),) = stopped
     robot.world.run(max(0.0, at + 0.3 - robot.world.now()))
     assert robot.world.now() - at < 0.32 or leg == 0
@@ -187,13 +192,13 @@ def test_stop_in_any_leg_brings_it_to_rest_and_nothing_is_written(leg: int, tmp_
 
 
 def test_a_run_beyond_3_sigma_is_repeated_and_one_that_stays_so_refused(tmp_path: Path) -> None:
-    _, person = measure(tmp_path, wanted=Wanted(straights=4, length_m=0.6), slips={3: 60.0})
-    (line,) = [line for line in person.told if "is repeated" in line]
+    told = measure(tmp_path, Wanted(straights=4, length_m=0.6), slips={3: 60.0})
+    (line,) = [line for line in told if "is repeated" in line]
     assert line.startswith("3 of 6, straight there is ")
     assert max(map(abs, off_percent(tmp_path))) < 1
     (tmp_path / "odometry.json").unlink()
     with pytest.raises(PebbleError, match=r"3 of 6, straight there stays .* does a wheel slip"):
-        measure(tmp_path, wanted=Wanted(straights=4, length_m=0.6), slips=dict.fromkeys((3, 5, 7), 60.0))
+        measure(tmp_path, Wanted(straights=4, length_m=0.6), slips=dict.fromkeys((3, 5, 7), 60.0))
     assert not (tmp_path / "odometry.json").exists()
 
 
@@ -209,7 +214,7 @@ def test_too_few_runs_are_refused(straights: int, spins: int, said: str) -> None
 def test_without_hall_sensors_the_key_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Measured, "receive", lambda *_: None)
     with pytest.raises(PebbleError, match=r"no hall sensors: set .*publish_touch_sensors"):
-        measure(tmp_path, wanted=QUICK)
+        measure(tmp_path, QUICK)
     assert [path.name for path in tmp_path.iterdir()] == ["room.json"]
 
 
