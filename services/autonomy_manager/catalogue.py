@@ -67,7 +67,6 @@ class _Answer(NamedTuple):
     problem: str = ""
     broken: bool = False  # because of ``problem`` it cannot be started; else it only has no settings
     asked: bool = True  # False: what it says itself is not known yet
-    drives: bool = True  # False: it says itself that it only measures, and never drives
 
 
 class Catalogue:
@@ -160,7 +159,7 @@ class Catalogue:
             broken=answer.problem if answer.broken else "",
             asked=answer.asked,
             own_program=bool(described.command),
-            drives=answer.drives,
+            drives=described.drives or not answer.ours,  # only one of ours is kept from driving by what it says
         )
 
     def _answer(self, name: str, folder: Path, entry: Path, section: ScriptSection, *, asks: bool) -> _Answer:
@@ -202,15 +201,16 @@ class Catalogue:
             if section.python is not None:  # it may be valid for that Python
                 return _Answer(described, problem=problem)
             return _Answer(described, problem=str(error), broken=True)
-        if not ours or not self._asks:  # only ours are asked, and only if this catalogue asks
-            return _Answer(described, ours, problem)
-        if not asks:  # it is ours, and is asked later
-            return _Answer(described, ours, problem, asked=False)
+        if not ours:
+            return _Answer(described, problem=problem)
+        described = Description()
+        if not self._asks or not asks:  # this catalogue asks none, or later
+            return _Answer(described, ours, asked=not self._asks)
         try:
             answer = ask(self._command(folder, entry, section, described, ours=True), folder, environment(section.env))
         except DescribeError as error:
             return _Answer(described, ours, problem=str(error), broken=isinstance(error, BrokenScriptError))
-        return _Answer(replace(answer, command=[]), ours, problem, drives=answer.drives)
+        return _Answer(replace(answer, command=[]), ours)
 
     def _command(
         self, folder: Path, entry: Path, section: ScriptSection, described: Description, *, ours: bool

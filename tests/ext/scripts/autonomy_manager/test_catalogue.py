@@ -93,6 +93,7 @@ def test_a_relative_folder_is_beside_the_config_and_ours_come_last(tmp_path: Pat
 def test_one_of_ours_is_asked_once_and_no_other(tmp_path: Path) -> None:
     write(tmp_path, "walk", PRETENDS)
     write(tmp_path, "foreign", "open('asked', 'a').write('x')")
+    write(tmp_path, "walk", '{"label": "Other", "drives": false}', "script.json")
     catalogue = Catalogue(config(tmp_path))
     listed: list[dict[str, bool]] = []
     catalogue.scan(lambda found: listed.append({name: script.asked for name, script in found.items()}))
@@ -102,6 +103,7 @@ def test_one_of_ours_is_asked_once_and_no_other(tmp_path: Path) -> None:
     assert not (tmp_path / "foreign/asked").exists()
     assert (found["walk"].label, found["walk"].ours, found["walk"].command[0]) == ("Walk", True, sys.executable)
     assert [setting.key for setting in found["walk"].settings] == ["speed", "laps"]
+    assert found["walk"].drives, "its own answer counts"
     assert (found["foreign"].settings, found["foreign"].ours) == ((), False)
 
 
