@@ -361,9 +361,10 @@ def test_where_names_are_checked_only_who_has_control_starts_a_script(tmp_path: 
 
 
 def test_a_start_before_the_first_list_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    lists = threading.Event()
+    lists, scans = threading.Event(), list[Catalogue]()
 
-    def scan(_catalogue: Catalogue, found: Callable[[dict[str, Script]], None]) -> None:
+    def scan(catalogue: Catalogue, found: Callable[[dict[str, Script]], None]) -> None:
+        scans.append(catalogue)
         assert lists.wait(WAIT_S)
         found(SCRIPTS)
 
@@ -373,4 +374,6 @@ def test_a_start_before_the_first_list_is_refused(tmp_path: Path, monkeypatch: p
         assert bench.becomes(error="Unknown autonomy file: walk: scripts are still being listed, try again")
         lists.set()
         assert until(lambda: bench.world.newest_raw("autonomy-files"))
+        assert until(lambda: bench.world.newest_raw("autonomy-files"))
         bench.start("walk")
+        assert len(scans) < 4, "the scripts are listed every five seconds"
