@@ -1,15 +1,14 @@
 """A guard that ends all script processes when this process has ended, before another manager starts."""
 
-import fcntl
 import logging
 import os
 import signal
 import subprocess
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 from pebble.errors import PebbleError
+from pebble.extensions.scripts.runs import locked_within
 from pebble.runtime.environment import child_environment
 
 # At the end of its input, this process has ended. A process that is killed cannot do this itself, and the kernel's
@@ -24,7 +23,6 @@ kill -s KILL -- "-$group"
 await 50
 """
 _LOCKED_S = 5.0  # longer than the program takes
-_TRY_S = 0.02
 
 log = logging.getLogger(__name__)
 
@@ -48,12 +46,12 @@ class Guard:
         except OSError as error:
             log.warning("%s cannot be opened: %s", self._path, error.strerror)
             return  # scripts run all the same, as where the file system has no locks
-        deadline = time.monotonic() + _LOCKED_S
-        while not self._try_to_lock():
-            if time.monotonic() > deadline:
+        try:
+            if not locked_within(_LOCKED_S, self._descriptor):
                 self.close()
                 raise PebbleError(f"scripts of an earlier process are still running: end what has {self._path} open")
-            time.sleep(_TRY_S)
+        except OSError as error:  # a file system without locks, where scripts run all the same
+            log.warning("%s cannot be locked: %s", self._path, error.strerror)
 
     def watch(self, group: int, number: signal.Signals) -> Callable[[], None]:
         """Start a helper that ends a process group if this process dies: with signal ``number``, then SIGKILL.
@@ -81,12 +79,3 @@ class Guard:
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1
-
-    def _try_to_lock(self) -> bool:
-        try:
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return False
-        except OSError as error:  # a file system without locks, where scripts run all the same
-            log.warning("%s cannot be locked: %s", self._path, error.strerror)
-        return True

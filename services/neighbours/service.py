@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from functools import partial
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
 
 from pebble.config import Config
 from pebble.contract import (
@@ -19,22 +23,25 @@ from pebble.contract import (
     codec,
 )
 from pebble.contract.identity import Identity
-from pebble.contract.payloads import Drive, Neighbours
+from pebble.contract.payloads import LAST_RUN, Drive, Neighbours
 from pebble.errors import PebbleError
 from pebble.extensions.operator.client.robot_estop import RobotEstop
 from pebble.extensions.scripts.runs import LocalScriptsLock, next_run
 from pebble.extensions.scripts.script.neighbour import PRESENT_S
+from pebble.motion.arbiter import newer
 from pebble.runtime.addresses import Addresses
 from pebble.runtime.connections import client_of_hub
 from pebble.runtime.process import view_of
 from pebble.runtime.service import WAIT_LIMIT_S, Service, every, on
-from pebble.services.neighbours.begun import begin
+from pebble.runtime.whole_file import make_folder, write
 from pebble.services.neighbours.config import Neighbours as NeighboursSection
 from pebble.services.neighbours.visit import Visit
 from pebble.transports import Message, QoS, Transport, create
 
 HEARTBEAT_S = 0.25
 MOST_BYTES = 16 * 1024  # of a message of another robot
+
+_decode = msgspec.json.Decoder(dict[str, Annotated[int, msgspec.Meta(gt=0, le=LAST_RUN)]]).decode
 
 
 class NeighboursService(Service):
@@ -190,3 +197,27 @@ def _lan_transport(config: Config) -> Transport:
     lan = config.section(NeighboursSection).lan
     settings = client_of_hub(config.run_dir() / "lan", lan, lan.lease_ms, lan.account)
     return create("zenoh", f"{config.base}-lan", settings)
+
+
+def begin(path: Path, names: Collection[str], name: str, run: int) -> str:
+    """Note that this run of robot ``name`` begins; return why it must not, or "". A run begins only once.
+
+    ``path`` holds the newest run of each of ``names``, the robots that may begin any. If the file cannot be read or
+    written, no run begins until it can: otherwise a run that a person has stopped would continue after a restart.
+    """
+    try:
+        newest = _decode(path.read_bytes())
+    except FileNotFoundError:
+        newest = {}
+    except (OSError, msgspec.MsgspecError) as error:
+        why = getattr(error, "strerror", None) or "it is damaged"
+        return f"{path} cannot be read ({why}): delete it while the scripts of other robots are stopped"
+    if not newer(run, newest.get(name, 0)):
+        return "it was ended here: start it again"
+    newest = {other: last for other, last in newest.items() if other in names} | {name: run}
+    try:
+        make_folder(path.parent)
+        write(path, msgspec.json.encode(newest), 0o600, PebbleError)
+    except (OSError, PebbleError) as error:
+        return f"its beginning cannot be written: {error}"
+    return ""

@@ -2,25 +2,21 @@
 
 import os
 from collections.abc import Iterator
-from typing import Annotated, Any
+from typing import Annotated, ClassVar
 from urllib.parse import urlsplit
 
 from msgspec import UNSET, Meta
 from msgspec.structs import replace
 
-from pebble import contract as c
 from pebble.config import Config
 from pebble.config.hosts import is_loopback
-from pebble.config.problems import Notes, Path
+from pebble.config.problems import Path
 from pebble.config.reader import Reader, Rule
-from pebble.config.tree import Root
-from pebble.config.types import EMPTY, EXACT, Host, LogLevel, Section, Topic, doc
+from pebble.config.types import BY_CONTRACT, EXACT, Host, Section, ServiceSection, doc
 from pebble.contract.capabilities import CapabilitiesValue, TelemetryOffer
-from pebble.contract.identity import Identity
 from pebble.extension import Facts, Program, Stage
 
 NONE = "none"
-_PATH: Path = ("services", "ros1_bridge")
 
 RosName = Annotated[
     str, Meta(pattern=r"^/?[A-Za-z]\w*(/[A-Za-z]\w*)*$(?!\n)", extra={"expected": "a name of ROS such as /cmd_vel"})
@@ -34,19 +30,6 @@ MasterUri = Annotated[
     EXACT,
 ]
 Period = Annotated[float, Meta(ge=0.05, le=3600)]
-
-#: The channel of each metric, by the original's key.
-CHANNELS = {
-    "wheel_odometry": c.WHEEL_ODOMETRY,
-    "localization_pose": c.LOCALIZATION_POSE,
-    "navigation_status": c.NAVIGATION_STATUS,
-    "navigation_goal": c.NAVIGATION_GOAL,
-    "navigation_local_plan": c.NAVIGATION_LOCAL_PLAN,
-    "navigation_global_plan": c.NAVIGATION_GLOBAL_PLAN,
-    "diagnostics": c.DIAGNOSTICS,
-    "charging_level": c.CHARGING_LEVEL,
-    "charging_status": c.CHARGING_STATUS,
-}
 
 
 class Driving(Section, frozen=True, kw_only=True):
@@ -100,21 +83,24 @@ class Motion(Section, frozen=True, kw_only=True):
 class Safety(Section, frozen=True, kw_only=True):
     """Limits after which the base is stopped."""
 
+    retired: ClassVar = {
+        "ignore_retained_drive": "a retained command is always refused",
+        "stop_on_shutdown": "a stop is always sent last",
+    }
+
     drive_timeout_seconds: Annotated[
         float,
         Meta(gt=0, le=5),
         doc("No drive command for this long: stop. A page of the original repeats every 0.5 s."),
     ] = 0.75
-    ignore_retained_drive: Annotated[bool, doc("The original's; retained commands are always refused.")] = True
-    stop_on_shutdown: Annotated[bool, doc("The original's; a stop is always sent last.")] = True
 
 
 class Metric(Section, frozen=True, kw_only=True):
-    """One metric. The contract fixes QoS and retain flag."""
+    """One metric."""
+
+    retired: ClassVar = BY_CONTRACT
 
     enabled: Annotated[bool, doc("Publish it.")] = True
-    qos: Annotated[int | None, doc("The original's; not used.")] = None
-    retain: Annotated[bool | None, doc("The original's; not used.")] = None
 
 
 class Sampled(Metric, frozen=True, kw_only=True):
@@ -183,14 +169,12 @@ class Metrics(Section, frozen=True, kw_only=True):
     charging_status: Annotated[StatusOfCharger, doc("Its charger.")] = StatusOfCharger()
 
 
-class Ros1(Section, frozen=True, kw_only=True):
+class Ros1(ServiceSection, frozen=True, kw_only=True):
     """Drives a base with ROS 1 and reads its telemetry."""
 
-    enabled: Annotated[bool, doc("Start this service.")] = False
-    log_level: Annotated[LogLevel | None, doc("The original's; the one of the file is for all services.")] = None
+    retired: ClassVar = {"topics": "they are those of the contract", "heartbeat": "mqtt_bridge sends it"}
+
     drive: Annotated[Driving, doc("Driving.")] = Driving()
-    topics: Annotated[dict[str, Topic], doc("The original's; they are those of the contract.")] = EMPTY
-    heartbeat: Annotated[dict[str, Any], doc("The original's; `mqtt_bridge` sends the heartbeat.")] = EMPTY
     ros: Annotated[Ros, doc("Node and topics.")] = Ros()
     motion: Annotated[Motion, doc("Speeds.")] = Motion()
     safety: Annotated[Safety, doc("When to stop.")] = Safety()
@@ -209,55 +193,27 @@ class Ros1(Section, frozen=True, kw_only=True):
         return self.ros.host or os.environ.get("ROS_IP") or os.environ.get("ROS_HOSTNAME") or "127.0.0.1"
 
 
-def _check(reader: Reader, root: Root, _: Path) -> Root:
-    """Note the keys that the original Pebble's bridge to ROS has, and that this one treats otherwise."""
-    section: Ros1 = root.services.ros1_bridge  # type: ignore[attr-defined]  # of this extension
+def _check(reader: Reader, section: Ros1, path: Path) -> Ros1:
+    """Note a lock on the topic of commands, and what lets other machines drive the base."""
     if not section.enabled:
-        return root
-    notes = reader.notes
-    robot = root.robot
-    if robot.id:
-        base = Identity(robot.system, robot.type, robot.id).base
-        topics = {name: channel.topic(base) for name, channel in {"drive_values": c.DRIVE, **CHANNELS}.items()}
-        for name, topic in section.topics.items():
-            if name not in topics:
-                notes.problem((*_PATH, "topics", name), f"unknown key, the known ones are {', '.join(topics)}")
-            elif topic != topics[name]:
-                why = f"must be {topics[name]}, as the contract has it; leave it out"
-                notes.problem((*_PATH, "topics", name), why)
-    _warn(notes, section)
-    if section.drives and section.ros.estop_topic == section.ros.cmd_vel_topic:
+        return section
+    notes, ros = reader.notes, section.ros
+    if section.drives and ros.estop_topic == ros.cmd_vel_topic:
         why = "is cmd_vel_topic, too: write the lock of the multiplexer, or none"
-        notes.problem((*_PATH, "ros", "estop_topic"), why)
-    return root
-
-
-def _warn(notes: Notes, section: Ros1) -> None:
-    if section.heartbeat.get("enabled"):
-        notes.warning((*_PATH, "heartbeat"), "is not sent a second time: mqtt_bridge sends it")
-    if section.log_level not in (None, "INFO"):
-        notes.warning((*_PATH, "log_level"), "is not used: log_level at the top of the file is for all services")
-    if not section.safety.ignore_retained_drive:
-        notes.warning((*_PATH, "safety", "ignore_retained_drive"), "is not used: a retained command is always refused")
-    if not section.safety.stop_on_shutdown:
-        notes.warning((*_PATH, "safety", "stop_on_shutdown"), "is not used: a stop is always sent last")
-    for name, channel in CHANNELS.items():
-        metric: Metric = getattr(section.telemetry, name)
-        for key, fixed in (("qos", channel.default_qos), ("retain", channel.default_retain)):
-            if getattr(metric, key) not in (None, fixed):
-                notes.warning((*_PATH, "telemetry", name, key), f"is not used: the contract has {fixed!s}".lower())
-    if section.ros.master_uri and not is_loopback(urlsplit(section.ros.master_uri).hostname or ""):
+        notes.problem((*path, "ros", "estop_topic"), why)
+    if ros.master_uri and not is_loopback(urlsplit(ros.master_uri).hostname or ""):
         why = "is another machine, and ROS has no passwords: whoever reaches it drives this base"
-        notes.warning((*_PATH, "ros", "master_uri"), why)
-        if not section.ros.host:
+        notes.warning((*path, "ros", "master_uri"), why)
+        if not ros.host:
             why = "is missing: nodes on other machines reach this one only by the address that it names"
-            notes.warning((*_PATH, "ros", "host"), why)
-    elif section.ros.host and not is_loopback(section.ros.host):
+            notes.warning((*path, "ros", "host"), why)
+    elif ros.host and not is_loopback(ros.host):
         why = "is open to other machines, and ROS has no passwords: whoever reaches it drives this base"
-        notes.warning((*_PATH, "ros", "host"), why)
+        notes.warning((*path, "ros", "host"), why)
+    return section
 
 
-RULES: tuple[Rule, ...] = ((Root, _check),)
+RULES: tuple[Rule, ...] = ((Ros1, _check),)
 
 
 def programs(config: Config) -> list[Program]:

@@ -354,7 +354,7 @@ class TestMistakes:
             ("robot.system", "+0", "must be a topic level"),
             ("local_mqtt.protocol", "0", 'must be "3.1.1" or "5", not the text "0"'),
             ("services.homeassistant.expose", "00", 'must be a list […], not the text "00"'),
-            ("services.ros1_bridge.telemetry.wheel_odometry.retain", "x", "must be true or false, not text"),
+            ("services.ros1_bridge.telemetry.wheel_odometry.enabled", "x", "must be true or false, not text"),
             ("services.soundboard_handler.playback.player_command", " ", "holds no word: write a list of words"),
             ("local_mqtt.port", [], "must be a whole number from 1 to 65535, not a list"),
             ("local_mqtt.password_file", "~nobody-at-all/x", "names a home folder that"),

@@ -137,15 +137,21 @@ def _next(path: Path, barred: int, wall_clock: Callable[[], float], received: in
 
 
 def _lock(file: int, path: Path, how: int = fcntl.LOCK_EX) -> None:
-    """Lock a file, waiting for other processes, but not for a frozen one. Raises PebbleError."""
-    deadline = time.monotonic() + _LOCKED_S
+    """Lock a file, waiting for other processes, but not for a frozen one. Raises PebbleError, or OSError."""
+    if not locked_within(_LOCKED_S, file, how):
+        raise PebbleError(f"no run can begin: end what has locked {path}")
+
+
+def locked_within(seconds: float, file: int, how: int = fcntl.LOCK_EX) -> bool:
+    """Lock a file; return False if others hold it for so long. Raises OSError where the system has no locks."""
+    deadline = time.monotonic() + seconds
     while True:
         try:
             fcntl.flock(file, how | fcntl.LOCK_NB)
-            return
+            return True
         except BlockingIOError:
             if time.monotonic() > deadline:
-                raise PebbleError(f"no run can begin: end what has locked {path}") from None
+                return False
         time.sleep(_TRY_S)
 
 

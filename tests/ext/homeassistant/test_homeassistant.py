@@ -100,6 +100,10 @@ def test_each_robot_has_a_valid_message_by_which_nothing_moves(robot: str, unit:
     allowed = {"stop": "estop", "video": "flags/mqtt-video", "light": "lights-solid"}
     allowed |= {"restart": "flags/service-restart", "reboot": "flags/reboot"}
     assert plain == {key: f"{base}/incoming/{allowed[key]}" for key in commands}
+    with_name = {key for key, topic in commands.items() if "/incoming/by/homeassistant/" in topic}
+    assert with_name == (commands.keys() - {"stop"} if offered.get("named") else set())
+    retained = {key for key, part in components.items() if part.get("ret")}
+    assert retained == (components.keys() & {"video"} if not with_name else set()), "nothing with a name"
     assert ("battery" in components) is bool(unit)
     ids = [part["uniq_id"] for part in components.values()]
     assert len(set(ids)) == len(ids)
@@ -110,7 +114,6 @@ def test_what_a_robot_offers_is_there_and_only_what_is_exposed() -> None:
     assert [*components][:7] == ["presence", "stop", "battery", "charging", "camera", "video", "light"]
     assert {key.partition("_")[0] for key in [*components][7:]} == {"stopped"}
     assert [*json.loads(discovery(BASE, EVERYTHING, ("reboot",)))["cmps"]][6] == "reboot"
-    assert {key for key, part in components.items() if part.get("ret")} == {"video"}
     assert [*json.loads(discovery(BASE, {}))["cmps"]] == ["presence"]
 
 
@@ -121,18 +124,6 @@ def test_what_it_sends_is_understood() -> None:
     light = re.sub(r"{{.+?}}", "0.5", components["light"]["cmd_on_tpl"])
     assert codec.decode(LIGHTS_SOLID, light.encode()) == LightsSolid(r=0.5, g=0.5, b=0.5)
     assert codec.decode(LIGHTS_SOLID, components["light"]["cmd_off_tpl"].encode()) == LightsSolid()
-
-
-def test_with_names_all_commands_but_stop_have_one() -> None:
-    components = json.loads(discovery(BASE, {**EVERYTHING, "named": True}, ("restart",)))["cmps"]
-    commands = {
-        key: part["cmd_t"].removeprefix(f"{BASE}/incoming/") for key, part in components.items() if "cmd_t" in part
-    }
-    assert commands == {
-        "stop": "estop", "video": "by/homeassistant/flags/mqtt-video", "light": "by/homeassistant/lights-solid",
-        "restart": "by/homeassistant/flags/service-restart",
-    }  # fmt: skip
-    assert components["video"]["ret"] is False  # nothing is retained there
 
 
 def test_no_two_robots_have_one_id() -> None:

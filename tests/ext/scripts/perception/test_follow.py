@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from pebble.contract import APRILTAG_DATA, VIDEO_OVERLAYS
 from pebble.contract.payloads import WheelOdometry
 from pebble.extensions.lab.simulation.world.script_robot import SimulatedRobot, load_script
 from pebble.extensions.scripts.perception.follow import Command, Follower, FollowSettings
@@ -171,3 +172,9 @@ def test_a_robot_arrives_at_the_tag_although_its_pictures_are_blurred(tmp_path: 
     script.time = SimpleNamespace(monotonic=robot.world.now, time=robot.world.now)  # type: ignore[attr-defined]
     robot.run(script.main, script.Options(), seconds=15.0)
     assert robot.distance_to(tag=13) == pytest.approx(0.6, abs=0.05)
+    data = [value for channel, value in robot.published if channel is APRILTAG_DATA]
+    shapes = [value.shapes for channel, value in robot.published if channel is VIDEO_OVERLAYS]
+    assert any(tag.detected for tag in data)
+    assert any(shapes)
+    assert (data[-1].detected, shapes[-1]) == (False, []), "at its end"
+    assert 100 < len(data) <= 152, "10 a second"

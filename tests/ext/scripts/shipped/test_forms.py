@@ -34,11 +34,14 @@ def described(name: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_each_has_a_sentence_and_main_settings_and_those_that_only_measure_say_so(name: str) -> None:
+def test_each_has_a_sentence_and_main_settings_and_says_whether_it_drives_and_what_it_needs(name: str) -> None:
     found = described(name)
     assert found.get("drives", True) is (name not in ("apriltag-locations", "wheel-odometry"))
     assert 10 < len(found["summary"]) <= 160
     assert 1 < len(found["main"]) <= 3
+    needs = {need["file"]: need["config"] for need in found["dependencies"]}
+    of_odometry = {"apriltag-locations": {}, "wheel-odometry": {"use_tune_state": False}}
+    assert needs == (of_odometry if name == "apriltag-odom-follow" else {})
 
 
 @pytest.mark.parametrize("name", ORIGINALS)
@@ -50,13 +53,6 @@ def test_the_originals_settings_are_all_there(name: str) -> None:
     assert [[entry.get(key) or None for key in essential] for entry in got] == [
         [entry.get(key) or None for key in essential] for entry in wanted
     ]
-
-
-def test_following_by_odometry_has_27_settings_and_needs_two_scripts() -> None:
-    found = described("apriltag-odom-follow")
-    assert len(found["configs"]) == 27
-    needs = {need["file"]: need["config"] for need in found["dependencies"]}
-    assert needs == {"apriltag-locations": {}, "wheel-odometry": {"use_tune_state": False}}
 
 
 def tuned_in(folder: Path, **options: Any) -> OdometrySettings:
@@ -71,15 +67,17 @@ def tuned_in(folder: Path, **options: Any) -> OdometrySettings:
     [
         ({"left_mm_per_event": 10.1, "right_mm_per_event": 10.3, "track_width_mm": 128.0}, 128.0),
         ({"left_mm_per_event": 10.1}, 130.5),
+        ({"track_width_mm": -1}, 130.5),
+        ([], 130.5),
     ],
 )
 def test_of_the_originals_tuning_only_the_width_of_the_track_counts(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, values: dict[str, float], track_mm: float
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, values: Any, track_mm: float
 ) -> None:
     (tmp_path / "auto_tune_state.json").write_text(json.dumps({"version": 1, "current_values": values}))
     tuned = tuned_in(tmp_path, use_tune_state=True, right_mm_per_event=19.0)
     assert (tuned.track_width_mm, tuned.left_mm_per_event, tuned.right_mm_per_event) == (track_mm, 0, 19.0)
-    assert "counts steps twice" in caplog.text
+    assert ("counts steps twice" if track_mm == 128 else "the geometry counts") in caplog.text
 
 
 MEASURED = {"left_step_mm": 19.36, "right_step_mm": 18.97, "track_mm": 134.4}
@@ -103,8 +101,3 @@ def test_the_calibration_of_its_folder_counts_unless_options_say_otherwise(
     assert (tuned.left_mm_per_event, tuned.right_mm_per_event, tuned.track_width_mm) == wheels
     assert remark in caplog.text
     assert bool(remark) == bool(caplog.text)
-
-
-def test_the_tags_size_must_be_given_or_confirmed() -> None:
-    (entry,) = (entry for entry in described("apriltag-follow")["configs"] if entry["key"] == "tag_size_m")
-    assert (entry["arg"], entry["required"], entry["default"], entry["min"]) == ("--marker-size", True, 0.25, 0.01)

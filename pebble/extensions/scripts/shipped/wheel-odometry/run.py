@@ -1,13 +1,12 @@
 """Publishes where the robot is, from its wheels' hall sensors and what its motors are commanded."""
 
 import json
-import math
 import queue
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
-from msgspec import convert
+from msgspec import Meta, convert
 from msgspec.json import decode
 from msgspec.structs import replace
 
@@ -85,28 +84,23 @@ def tuned(robot: Robot, options: OdometrySettings) -> OdometrySettings:
         pass
     except (OSError, ValueError) as error:
         robot.log.warning("%s: %s; the geometry counts", CALIBRATION, error)
-    width = tune_state(robot).get("track_width_mm") if options.use_tune_state else None
-    return replace(options, track_width_mm=options.track_width_mm if width is None else width)
+    width_mm = tuned_width_mm(robot) if options.use_tune_state else None
+    return replace(options, track_width_mm=width_mm or options.track_width_mm)
 
 
-def tune_state(robot: Robot) -> dict[str, float]:
-    """Return the numbers of the original's tuning program, without step lengths: that program counts steps twice."""
+def tuned_width_mm(robot: Robot) -> float | None:
+    """Return the track's width by the original's tuning program, None if it has none.
+
+    Its step lengths are not used: they are 0.5 to 0.6 of the truth, as that program counts steps twice.
+    """
     try:
-        values = convert(
-            json.loads((robot.config.folder / TUNE_STATE).read_text(encoding="utf-8"))["current_values"], dict[str, Any]
-        )
+        width_mm = json.loads((robot.config.folder / TUNE_STATE).read_bytes())["current_values"]["track_width_mm"]
+        width_mm = convert(width_mm, Annotated[float, Meta(gt=0, le=5000)])
     except (OSError, ValueError, KeyError, TypeError) as error:
         robot.log.warning("%s: %s; the geometry counts", TUNE_STATE, error)
-        return {}
-    step_lengths = [key for key in values if key.endswith("_mm_per_event")]
-    if step_lengths:
-        text = "%s: %s: not used, they are 0.5 to 0.6 of the truth: the program that wrote them counts steps twice"
-        robot.log.warning(text, TUNE_STATE, " and ".join(step_lengths))
-    numbers: dict[str, float] = {}
-    for key, value in values.items():
-        if key not in step_lengths and isinstance(value, int | float) and math.isfinite(value) and value > 0:
-            numbers[key] = float(value)
-    return numbers
+        return None
+    robot.log.warning("%s: only track_width_mm is used: the program that wrote it counts steps twice", TUNE_STATE)
+    return float(width_mm)
 
 
 if __name__ == "__main__":
