@@ -31,7 +31,8 @@ from pebble.services.autonomy_manager.describe import (
     read_manifest,
     stamp,
 )
-from pebble.services.autonomy_manager.environment import environment, interpreter, local_login
+from pebble.services.autonomy_manager.environment import environment, local_login
+from pebble.services.autonomy_manager.interpreter import interpreter
 from pebble.services.autonomy_manager.script import Dependency, Script
 
 MAX_SCRIPTS = 256  # that are listed
@@ -67,6 +68,7 @@ class _Answer(NamedTuple):
     problem: str = ""
     broken: bool = False  # because of ``problem`` it cannot be started; else it only has no settings
     asked: bool = True  # False: what it says itself is not known yet
+    drives: bool = True  # False: it says itself that it only measures, and never drives
 
 
 class Catalogue:
@@ -159,7 +161,7 @@ class Catalogue:
             broken=answer.problem if answer.broken else "",
             asked=answer.asked,
             own_program=bool(described.command),
-            drives=described.drives or not answer.ours,  # only one of ours is kept from driving by what it says
+            drives=answer.drives,
         )
 
     def _answer(self, name: str, folder: Path, entry: Path, section: ScriptSection, *, asks: bool) -> _Answer:
@@ -179,7 +181,7 @@ class Catalogue:
         return answer
 
     def _describe(self, folder: Path, entry: Path, section: ScriptSection, *, asks: bool) -> _Answer:
-        """Return a script's description: one of ours is asked, any other has the one in its `script.json`.
+        """Return a script's description: by its files, and if it is one of ours, by its own answer.
 
         ``asks`` False: do not run it now; the description says if it has still to be asked.
         """
@@ -201,16 +203,17 @@ class Catalogue:
             if section.python is not None:  # it may be valid for that Python
                 return _Answer(described, problem=problem)
             return _Answer(described, problem=str(error), broken=True)
-        if not ours:
-            return _Answer(described, problem=problem)
-        described = Description()
-        if not self._asks or not asks:  # this catalogue asks none, or later
-            return _Answer(described, ours, asked=not self._asks)
+        if not ours or not self._asks:  # only ours are asked, and only if this catalogue asks
+            return _Answer(described, ours, problem)
+        if not asks:  # it is ours, and is asked later
+            return _Answer(described, ours, problem, asked=False)
+        command = self._command(folder, entry, section, described, ours=True)
         try:
-            answer = ask(self._command(folder, entry, section, described, ours=True), folder, environment(section.env))
+            answer = ask(command, folder, environment(section.env))
+            return _Answer(_merged(described, answer), ours, problem, drives=answer.drives)
         except DescribeError as error:
-            return _Answer(described, ours, problem=str(error), broken=isinstance(error, BrokenScriptError))
-        return _Answer(replace(answer, command=[]), ours)
+            is_broken = isinstance(error, BrokenScriptError)
+            return _Answer(described, ours, problem=str(error), broken=is_broken)
 
     def _command(
         self, folder: Path, entry: Path, section: ScriptSection, described: Description, *, ours: bool
@@ -287,6 +290,22 @@ def _inside(root: Path) -> list[Path]:
         return [folder for folder in root.iterdir() if folder.is_dir()]
     except OSError:  # most often there is none
         return []
+
+
+def _merged(manifest: Description, answer: Description) -> Description:
+    """Return a manifest's description, with its missing fields taken from the script's own answer.
+
+    The manifest has no ``command``, else the script is not asked. ``drives`` the caller takes from the answer itself.
+    """
+    keys = {setting.key for setting in manifest.configs}
+    added = [setting for setting in answer.configs if setting.key not in keys]
+    return Description(
+        label=manifest.label or answer.label,
+        summary=manifest.summary or answer.summary,
+        main=manifest.main or answer.main,
+        configs=[*manifest.configs, *added][:MAX_SETTINGS],
+        dependencies=manifest.dependencies or answer.dependencies,
+    )
 
 
 def _dependencies(name: str, section: ScriptSection, described: Description) -> tuple[Dependency, ...]:

@@ -52,7 +52,8 @@ def _fitness(config: Config, script: Script) -> str:
         return f"does not run: {script.broken}"
     if script.ours:  # it uses pebble.script
         return "runs, Pebble's own"
-    from pebble.services.autonomy_manager.environment import environment, lacking
+    from pebble.services.autonomy_manager.environment import environment
+    from pebble.services.autonomy_manager.interpreter import lacking
 
     is_probed = not script.own_program and _may_run(config, script)  # what its script.json names may be no Python
     missing = lacking(script.command, script.folder, environment(ours=False)) if is_probed else []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,7 @@ _START = frozenset(("start", "run", "play", "enable", "enabled", "on"))
 _HALTS_S = (0.1, 0.3)  # after the first one
 _HOLD_S = HOLD_MS / 1000
 _SCAN_S = 5.0  # between two looks into the folder of scripts
+_LISTED_S, _AGAIN_S = 3.0, 0.1  # a start waits so long until its script is listed, and looks so often
 _CLOSE_S = 1.0  # for scripts to end after SIGTERM when this process ends; it is killed after 3 s
 
 
@@ -65,6 +67,7 @@ class AutonomyManager(Service):
         self._refused_until = float("-inf")  # until then the arbiter refuses scripts, so none is started
         self._status: AutonomyStatus | None = None  # as published last
         self._connected_before = False  # on_connected was called
+        self._waiting: Callable[[], None] | None = None  # a start, until its script is listed
         self._signs = True  # the newest run's script signs its drive commands; else they look like a person's
         self._unsigned_moves = False  # while it does not sign: the newest command without a signature moves the wheels
         self._person_moves = False  # the newest command that is certainly a person's moves the wheels
@@ -96,16 +99,21 @@ class AutonomyManager(Service):
         word = (command.action or "").strip().lower()
         is_known = word in (*_START, *STOP_WORDS)
         begin = word in _START if is_known else command.enabled
+        self._waiting = None  # a newer command takes the place of a start that waits
         if begin is None:
             self.log_limited.warning("command", "ignored a command that neither starts nor stops a script")
         elif begin:
             by = command.by if isinstance(command.by, str) else None
-            self._start_script((command.file or "").strip(), command.config or {}, by)
+            until = self.clock() + _LISTED_S  # until then the start may wait for the list of scripts
+            self._start_script((command.file or "").strip(), command.config or {}, by, until)
         else:
             self._runner.stop()
 
-    def _start_script(self, file: str, config: Mapping[str, Any], by: str | None) -> None:
-        """Start a script. ``by`` is the person who asks; None: a program of the robot, which needs no control."""
+    def _start_script(self, file: str, config: Mapping[str, Any], by: str | None, until: float) -> None:
+        """Start a script, or wait until ``until`` for the list of scripts to name it.
+
+        ``by`` is the person who asks; None: a program of the robot, which needs no control.
+        """
         try:
             if by is not None and self.config.security.named and (holder := self._owners.holder_beside(by)):
                 raise StartError(f"{holder} has control, and starts scripts")
@@ -115,11 +123,24 @@ class AutonomyManager(Service):
             self._check(wanted)
         except StartError as error:
             listing = isinstance(error, UnknownScriptError) and not self._offer.complete
+            if listing and self.clock() < until:
+                self._try_again(partial(self._start_script, file, config, by, until))
+                return
             why = f"{error}: scripts are still being listed, try again" if listing else str(error)
             self.log_limited.log("refused", logging.WARNING, "%s", why)
             self._runner.refuse(why, stopped=isinstance(error, StoppedError))
         else:
             self._runner.start(wanted)
+
+    def _try_again(self, start: Callable[[], None]) -> None:
+        """Call ``start`` again soon, unless another command, a person who drives or an emergency stop comes first."""
+
+        def again() -> None:
+            if self._waiting is start:
+                start()
+
+        self._waiting = start
+        self.later(_AGAIN_S, again)
 
     def _check(self, wanted: Plan) -> None:
         """Raise StartError if this robot cannot run ``wanted`` now."""
@@ -138,6 +159,8 @@ class AutonomyManager(Service):
     def motor_owner(self, state: EstopState, owner: str) -> None:
         """Handle the state of a motor owner: it may end the run, or show that all stops were reset."""
         self._owners.receive(owner, state)
+        if state.latched:
+            self._waiting = None
         run, stopped = self._runner.stoppable, bool(self._owners.refusal)  # stopped: an owner is latched now
         if run is not None and (why := self._owners.ending(run.number, run.baseline, self._signs)):
             self._runner.stop(why, stopped=stopped)
@@ -169,6 +192,7 @@ class AutonomyManager(Service):
     def _on_person_drives(self) -> None:
         """Let scripts wait for a person who drives, or end them, as the config says."""
         now = self.clock()
+        self._waiting = None  # a start that waits is given up
         if self._runner.active is not None and self._runner.drives and self._section.on_override == "stop":
             self._runner.stop(OVERRIDDEN)
         if now >= self._overridden_until:

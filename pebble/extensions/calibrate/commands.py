@@ -1,12 +1,12 @@
 """``pebble calibrate``: measures the wheels of a robot, or its camera."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
 from pebble.errors import PebbleError
-from pebble.extensions.calibrate.wheels import Person, Wanted, calibrate, check
+from pebble.extensions.calibrate.wheels import Wanted, calibrate, check
 from pebble.extensions.scripts.perception.odometry import Calibration, OdometrySettings
 from pebble.extensions.scripts.script import Robot, Stopped
 from pebble.extensions.scripts.script.program import run_for
@@ -14,7 +14,8 @@ from pebble.extensions.scripts.script.program import run_for
 _HELP = """Measure a robot's wheels, or its camera; docs/ext/calibrate.md explains how.
 
 \b
-    pebble calibrate wheels goob.json                  have a tape
+    pebble calibrate wheels goob.json                  a person has a tape
+    pebble calibrate wheels goob.json --truth tag      its camera sees a tag
     pebble calibrate camera goob.json --size 0.25      hold a tag before it
 """
 _Config = Annotated[
@@ -25,11 +26,30 @@ _Size = Annotated[float, typer.Option(help="Edge of the tag's black square, in m
 _NOTHING = "nothing was written"
 
 
+class _Terminal:
+    """A terminal that shows lines to a person, and reads the answers."""
+
+    def tell(self, line: str) -> None:
+        typer.echo(line)
+
+    def ask(self, question: str) -> str:
+        try:
+            return input(question)
+        except EOFError:
+            raise PebbleError("a person has to answer: run it in a terminal, or with --truth tag") from None
+
+
 def wheels(
     config: _Config,
+    truth: Annotated[
+        Literal["tape", "tag", "gyro"],
+        typer.Option(help="What is true: tape and marks on the floor, a tag on the wall, or tape and gyroscope."),
+    ] = "tape",
     length: Annotated[float, typer.Option(help="Of a straight, in metres.", min=0.3, max=10)] = 1.5,
     straights: Annotated[int, typer.Option(help="There and back, at least 4.")] = 6,
     spins: Annotated[int, typer.Option(help="Of three turns on the spot, at least 2.")] = 2,
+    tag: _Tag = 13,
+    size: _Size = 0.25,
     speed: Annotated[float, typer.Option(help="At half power, in metres a second, about.", min=0.02, max=3)] = 0.19,
     diameter: Annotated[float, typer.Option(help="Of a wheel in mm, about.", min=1, max=1000)] = 61.0,
     track: Annotated[float, typer.Option(help="Between the wheels in mm, about.", min=1, max=5000)] = 130.5,
@@ -42,12 +62,17 @@ def wheels(
 
     \b
         pebble calibrate wheels goob.json
+        pebble calibrate wheels goob.json --truth tag --tag 13 --size 0.25
+        pebble calibrate wheels goob.json --truth gyro --spins 4
     """
     expected = OdometrySettings(wheel_diameter_mm=diameter, track_width_mm=track, magnets=magnets)
-    wanted = Wanted(length_m=length, straights=straights, spins=spins, speed_m_s=speed, expected=expected)
+    wanted = Wanted(
+        truth=truth, length_m=length, straights=straights, spins=spins, speed_m_s=speed, tag=tag, tag_size_m=size,
+        expected=expected,
+    )  # fmt: skip
     check(wanted)
     results: list[Calibration] = []
-    _run(config, lambda robot: results.append(calibrate(robot, Person(), wanted)))
+    _run(config, lambda robot: results.append(calibrate(robot, _Terminal(), wanted)))
     (result,) = results
     left, right = expected.step_mm
     for name, value, expected_mm in (
@@ -99,7 +124,7 @@ def _calibrate_camera(config: Path, pictures: Any, tag: int, size: float, *, sti
     from pebble.extensions.scripts.perception.camera_model import CALIBRATION
     from pebble.extensions.scripts.perception.tags import FAMILY, TagFinder
 
-    corners, shape = collect(pictures, TagFinder(size), tag, Person(), still=still)
+    corners, shape = collect(pictures, TagFinder(size), tag, _Terminal(), still=still)
     lens = solve(corners, shape, size)
     path = config.parent / CALIBRATION
     save(path, lens, tag, size, FAMILY)

@@ -16,10 +16,10 @@ import pytest
 from pebble.errors import PebbleError
 from pebble.extensions.calibrate import commands
 from pebble.extensions.calibrate.camera import collect, read_folder, solve
-from pebble.extensions.calibrate.fit import SPIN_RAD, STRAIGHT_RAD, Fit, Run, fit
-from pebble.extensions.calibrate.wheels import arc
+from pebble.extensions.calibrate.fit import NOISE, Fit, Run, fit
+from pebble.extensions.calibrate.wheels import arc, between
 from pebble.extensions.scripts.perception.camera_model import CALIBRATION, CameraModel
-from pebble.extensions.scripts.perception.tags import TagFinder
+from pebble.extensions.scripts.perception.tags import Place, TagFinder
 from tests.ext.lab.simulation.world.worlds import seen, world_of
 from tests.support import cases
 
@@ -27,15 +27,15 @@ BELIEVED = (19.164, 19.164), 130.5
 LEFT, RIGHT, TRACK = 19.36, 18.97, 134.4
 
 
-def runs_of(seed: int, slip: float) -> list[Run]:
-    """Six straights and two spins, with the errors of a tape; ``slip`` is a part of the way."""
-    random = np.random.default_rng(seed)
+def runs_of(seed: int, truth: str, slip: float) -> list[Run]:
+    """Six straights and two spins, with the errors of ``truth``; ``slip`` is a part of the way."""
+    random, noise = np.random.default_rng(seed), NOISE[truth]
 
     def run(name: str, left_mm: float, right_mm: float, *, spin: bool) -> Run:
         left_steps, right_steps = (
             mm / step * (1 + random.normal(0, slip)) for mm, step in ((left_mm, LEFT), (right_mm, RIGHT))
         )
-        turn = (right_mm - left_mm) / TRACK + random.normal(0, SPIN_RAD if spin else STRAIGHT_RAD)
+        turn = (right_mm - left_mm) / TRACK + random.normal(0, noise.spin_rad if spin else noise.straight_rad)
         return Run(
             name, left_steps, right_steps, turn, None if spin else (left_mm + right_mm) / 2 + random.normal(0, 2)
         )
@@ -55,30 +55,41 @@ def off_percent(result: Fit) -> tuple[float, float, float]:
     return left, right, track
 
 
-def test_95_of_100_calibrations_are_as_exact_as_the_document_says() -> None:
-    off = [off_percent(fit(runs_of(seed, 0.003), *BELIEVED)) for seed in range(cases(200, 400))]
-    left, right, track = np.percentile(off, 95, axis=0)
-    assert max(left, right) < 0.3 * 1.15
-    assert track < 0.47 * 1.15
+@pytest.mark.parametrize(("truth", "step", "track"), [("tape", 0.3, 0.47), ("gyro", 0.28, 0.42)])
+def test_95_of_100_calibrations_are_as_exact_as_the_document_says(truth: str, step: float, track: float) -> None:
+    off = [off_percent(fit(runs_of(seed, truth, 0.003), NOISE[truth], *BELIEVED)) for seed in range(cases(200, 400))]
+    left, right, tracks = np.percentile(off, 95, axis=0)
+    assert max(left, right) < step * 1.15
+    assert tracks < track * 1.15
 
 
 def test_a_run_that_does_not_fit_is_the_worst() -> None:
-    runs = runs_of(1, 0.001)
-    assert fit(runs, *BELIEVED).worst is None
+    runs = runs_of(1, "tape", 0.001)
+    assert fit(runs, NOISE["tape"], *BELIEVED).worst is None
     assert runs[2].mm is not None
     wrong = [*runs[:2], runs[2]._replace(mm=runs[2].mm + 60), *runs[3:]]
-    result = fit(wrong, *BELIEVED)
+    result = fit(wrong, NOISE["tape"], *BELIEVED)
     assert result.worst == 2
     assert result.mm[2] == max(result.mm)
 
 
 @pytest.mark.parametrize(("sign", "turn_deg"), [(1, 0.0), (-1, 12.0), (1, -12.0)])
-def test_the_arc_by_a_tape_is_the_one_that_was_driven(sign: int, turn_deg: float) -> None:
+def test_the_arc_by_a_tape_and_by_a_tag_is_the_one_that_was_driven(sign: int, turn_deg: float) -> None:
     mm, turn = sign * 1500.0, math.radians(turn_deg)
     radius = mm / turn if turn else math.inf
-    moved = arc(*((radius * math.sin(turn), radius * (1 - math.cos(turn))) if turn else (mm, 0.0)))
-    assert moved.mm == pytest.approx(mm)
-    assert moved.turn_rad == pytest.approx(turn, abs=1e-9)
+    end = (radius * math.sin(turn), radius * (1 - math.cos(turn))) if turn else (mm, 0.0)
+    by_tape = arc(*end)
+    tag = (2300.0, 150.0)
+
+    def place(x: float, y: float, heading: float) -> Place:
+        ahead, left = tag[0] - x, tag[1] - y
+        angle = heading - math.atan2(left, ahead)
+        return Place(math.hypot(ahead, left, 80.0) / 1000, angle, -0.08)
+
+    by_tag = between(place(0.0, 0.0, 0.0), place(*end, turn))
+    for moved in (by_tape, by_tag):
+        assert moved.mm == pytest.approx(mm)
+        assert moved.turn_rad == pytest.approx(turn, abs=1e-9)
 
 
 SIZE, FOCAL = (640, 480), 320 / math.tan(math.radians(54.3) / 2)

@@ -158,9 +158,7 @@ class Operator:
         address = parse_topic(message.topic)
         with suppress(PayloadError):
             files = codec.decode(c.AUTONOMY_FILES, message.payload).files if message.payload else []
-            if address is not None and any(
-                script.get("file") == TRAIL and script.get("asked", True) for script in files
-            ):
+            if address is not None and any(script.get("file") == TRAIL for script in files):
                 self._with_trail.add(address.identity.base)
 
     def _is_free(self, robot: RobotView) -> bool:

@@ -10,6 +10,9 @@ from pebble.errors import PebbleError
 from pebble.extensions.scripts.perception.camera_model import CameraModel, Floats
 
 FAMILY = "APRILTAG_25H9"  # the original's default, in its spelling
+_PICTURE = "a picture is a numpy array of (height, width, 3) bytes, blue first, or (height, width)"
+#: By the number of colours.
+_HINTS = {(4,): ": leave out the last with picture[:, :, :3]", (1,): ": use picture[:, :, 0]"}
 
 
 class Place(NamedTuple):
@@ -17,6 +20,7 @@ class Place(NamedTuple):
 
     distance_m: float
     angle_rad: float
+    down_m: float = 0.0  # below the camera's axis
 
 
 class Tag(NamedTuple):
@@ -72,7 +76,7 @@ class TagGeometry:
         distance = math.sqrt(right * right + down * down + ahead * ahead)
         if not math.isfinite(distance) or ahead <= 0.0:
             return None
-        return Place(distance, math.atan2(right, ahead))
+        return Place(distance, math.atan2(right, ahead), down)
 
 
 class TagFinder:
@@ -112,11 +116,13 @@ class TagFinder:
 
 def _checked(picture: Any) -> Any:
     """Return a picture in the form that OpenCV takes. Raises PebbleError for anything else."""
-    is_array = isinstance(picture, np.ndarray) and picture.dtype == np.uint8 and picture.size > 0
-    if not is_array or not (picture.ndim == 2 or (picture.ndim == 3 and picture.shape[2] == 3)):
-        found = f"{picture.dtype} {picture.shape}" if isinstance(picture, np.ndarray) else type(picture).__name__
-        needed = "a numpy array of (height, width, 3) bytes, blue first, or (height, width)"
-        raise PebbleError(f"a picture is {needed}, not {found}")
+    if not isinstance(picture, np.ndarray):
+        raise PebbleError(f"{_PICTURE}, not {type(picture).__name__}")
+    if picture.dtype != np.uint8:
+        raise PebbleError(f"{_PICTURE}, not of {picture.dtype}")
+    colours = picture.shape[2:]  # (3,) for colours, () for grey
+    if not (picture.ndim == 2 or (picture.ndim == 3 and picture.shape[2] == 3)) or not picture.size:
+        raise PebbleError(f"{_PICTURE}, not of {picture.shape}{_HINTS.get(colours, '')}")
     return np.ascontiguousarray(picture)
 
 

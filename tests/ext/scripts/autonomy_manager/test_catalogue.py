@@ -24,7 +24,8 @@ from pebble.services.autonomy_manager.describe import (
     is_ours,
     read_manifest,
 )
-from pebble.services.autonomy_manager.environment import environment, interpreter, lacking
+from pebble.services.autonomy_manager.environment import environment
+from pebble.services.autonomy_manager.interpreter import interpreter, lacking
 from pebble.services.autonomy_manager.script import Script
 from tests.support import gone, until
 
@@ -33,7 +34,6 @@ PRETENDS = f"""
 if 0:
     from pebble.script import run
 open("asked", "a").write("x")
-print("hi")  # the last line counts
 print({ANSWER!r})
 """
 
@@ -93,7 +93,6 @@ def test_a_relative_folder_is_beside_the_config_and_ours_come_last(tmp_path: Pat
 def test_one_of_ours_is_asked_once_and_no_other(tmp_path: Path) -> None:
     write(tmp_path, "walk", PRETENDS)
     write(tmp_path, "foreign", "open('asked', 'a').write('x')")
-    write(tmp_path, "walk", '{"label": "Other", "drives": false}', "script.json")
     catalogue = Catalogue(config(tmp_path))
     listed: list[dict[str, bool]] = []
     catalogue.scan(lambda found: listed.append({name: script.asked for name, script in found.items()}))
@@ -103,7 +102,6 @@ def test_one_of_ours_is_asked_once_and_no_other(tmp_path: Path) -> None:
     assert not (tmp_path / "foreign/asked").exists()
     assert (found["walk"].label, found["walk"].ours, found["walk"].command[0]) == ("Walk", True, sys.executable)
     assert [setting.key for setting in found["walk"].settings] == ["speed", "laps"]
-    assert found["walk"].drives, "its own answer counts"
     assert (found["foreign"].settings, found["foreign"].ours) == ((), False)
 
 
@@ -204,16 +202,26 @@ def test_a_failure_is_logged_once_and_tried_again_after_a_minute(
     assert caplog.text.count("walk is offered without settings: its --describe: JSON is malformed") == 1
 
 
+OLD_NUMPY, CREATE = "numpy below 2.4 (float() of an array)", "cv2.aruco.DetectorParameters_create"
+SHMSRC = "import cv2\nPIPE = 'shmsrc socket-path=x ! appsink'\ncv2.VideoCapture(PIPE, cv2.CAP_GSTREAMER)"
+
+
 @pytest.mark.parametrize(
     ("text", "lacks"),
     [
         ("import nump, msgspec\nfrom nowhere.part import name", ["nump", "nowhere"]),
         ("try:\n    import nump\nexcept ImportError:\n    nump = None\ndef show():\n    import nowhere", []),
+        (SHMSRC, ["cv2 with GStreamer"]),
+        ("import numpy\nmap(float, numpy.zeros(3))", [OLD_NUMPY]),
+        ("from cv2 import aruco as a\nimport cv2\na.DetectorParameters_create()", [CREATE]),
+        ("import numpy as np\nnp.zeros(3, np.float)\nnp.linalg.norm(0)", ["numpy.float"]),
+        ("import cv2\nif hasattr(cv2.aruco, 'detectMarkers'): cv2.aruco.detectMarkers(0)", []),
         ("import subprocess, sys\nsubprocess.run([sys.executable, 'helper.py'])", ["nowhere"]),
         ("raise SystemExit('it was run')", []),
     ],
 )
 def test_what_a_script_lacks_is_found_without_running_it(tmp_path: Path, text: str, lacks: list[str]) -> None:
+    """The wheel's OpenCV has no GStreamer."""
     entry = write(tmp_path, "walk", text)
     write(tmp_path, "walk", "import nowhere", "helper.py")
     assert lacking((sys.executable, str(entry)), entry.parent, {}) == lacks
@@ -270,6 +278,14 @@ def test_what_is_no_file_is_not_opened(entry: Path) -> None:
 def asked(entry: Path, text: str) -> Description:
     entry.write_text(text)
     return ask([sys.executable, str(entry)], entry.parent, os.environ)
+
+
+def test_the_last_line_of_the_answer_counts(entry: Path) -> None:
+    answer = {"label": "Walk", "configs": [{"key": "speed", "type": "float", "default": None, "arg": "--speed"}]}
+    found = asked(
+        entry, f"import sys\nassert sys.argv[1:] == ['--describe']\nprint('hi')\nprint({json.dumps(answer)!r})"
+    )
+    assert (found.label, found.configs[0].key, found.dependencies) == ("Walk", "speed", [])
 
 
 @pytest.mark.parametrize(

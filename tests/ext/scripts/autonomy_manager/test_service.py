@@ -360,7 +360,22 @@ def test_where_names_are_checked_only_who_has_control_starts_a_script(tmp_path: 
         assert until(lambda: bench.children.all[-1].signals == [TERM])
 
 
-def test_a_start_before_the_first_list_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("between", "status"),
+    [
+        (lambda bench: None, {"running": True, "file": "walk"}),
+        (lambda bench: bench.command({"action": "stop"}), {"running": False, "error": None}),
+        (lambda bench: bench.owner(latched=True, count=1), {"running": False, "error": None}),
+        (
+            lambda bench: bench.advance(3.01),
+            {"error": "Unknown autonomy file: walk: scripts are still being listed, try again"},
+        ),
+    ],
+    ids=["nothing", "a stop", "an emergency stop", "three seconds"],
+)
+def test_a_start_waits_until_its_script_is_listed_unless_something_comes_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, between: Callable[[Bench], None], status: dict[str, Any]
+) -> None:
     lists, scans = threading.Event(), list[Catalogue]()
 
     def scan(catalogue: Catalogue, found: Callable[[dict[str, Script]], None]) -> None:
@@ -370,9 +385,14 @@ def test_a_start_before_the_first_list_is_refused(tmp_path: Path, monkeypatch: p
 
     monkeypatch.setattr(Catalogue, "scan", scan)
     with closing(Bench(tmp_path, None)) as bench:
+        bench.owner()
         bench.command({"action": "start", "file": "walk"})
-        assert bench.becomes(error="Unknown autonomy file: walk: scripts are still being listed, try again")
+        bench.quiet()
+        between(bench)
+        bench.quiet()
         lists.set()
         assert until(lambda: bench.world.newest_raw("autonomy-files"))
-        bench.start("walk")
-        assert len(scans) < 4, "the scripts are listed every five seconds"
+        bench.advance(0.11)
+        assert bench.becomes(**status)
+        assert len(bench.children.all) == bool(status.get("running"))
+        assert len(scans) < 4, "the scripts are listed every three seconds"
