@@ -1,4 +1,4 @@
-"""What all modules here share: one browser, and robots on microcontrollers, which are ready within two seconds."""
+"""What all modules here share: robots on microcontrollers, which are ready within two seconds."""
 
 from __future__ import annotations
 
@@ -7,15 +7,8 @@ from collections.abc import Iterator
 import pytest
 from playwright.sync_api import Browser
 
-from tests.ext.page.browser import chromium
 from tests.ext.page.console import Console, Wire, console, used
 from tests.ext.page.stage import Stage
-
-
-@pytest.fixture(scope="package")
-def browser() -> Iterator[Browser]:
-    with chromium() as running:
-        yield running
 
 
 @pytest.fixture(scope="package")
