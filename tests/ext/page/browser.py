@@ -179,11 +179,6 @@ def tab(
         context.close()
 
 
-def answer(source: str) -> Callable[[Route], object]:
-    """A route that has this module instead of the server's."""
-    return lambda route: route.fulfill(body=source, content_type="text/javascript")
-
-
 def _prepared(context: BrowserContext, script: str) -> Tab:
     page = context.new_page()
     opened = Tab(context, page)

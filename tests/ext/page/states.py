@@ -144,23 +144,19 @@ def goob(now: int) -> list[Value]:
     ]
 
 
-def many(count: int, stopped: int, driven: int, away: int, *, video: bool = False) -> Values:
-    """So many robots, of which each ``stopped``-th is stopped, and so on; the later ones have the fuller batteries."""
-
-    def make(now: int) -> list[Value]:
-        values = []
-        for number in range(1, count + 1):
-            ref = f"pebble/robots/robot-{number:04d}"
-            values += robot(now, ref, "mqtt", 7.2 + 0.001 * number, video=video)
-            if number % stopped == 0:
-                values.append((ref, "web/estop", estop(now, "eve on phone"), 0))
-            if number % driven == 0:
-                values.append((ref, "web/driver", driver("bob", "phone"), 0))
-            if number % away == 0:
-                values.append((ref, "web/liveness", liveness(online=False, silent_s=300.0), 0))
-        return values
-
-    return make
+def thousand(now: int) -> list[Value]:
+    """A thousand robots, of which some are stopped, driven or away; the later ones have the fuller batteries."""
+    values = []
+    for number in range(1, 1001):
+        ref = f"pebble/robots/robot-{number:04d}"
+        values += robot(now, ref, "mqtt", 7.2 + 0.001 * number, video=False)
+        if number % 97 == 0:
+            values.append((ref, "web/estop", estop(now, "eve on phone"), 0))
+        if number % 53 == 0:
+            values.append((ref, "web/driver", driver("bob", "phone"), 0))
+        if number % 41 == 0:
+            values.append((ref, "web/liveness", liveness(online=False, silent_s=300.0), 0))
+    return values
 
 
 def fleet(now: int) -> list[Value]:
@@ -282,19 +278,6 @@ def touch(now: int) -> dict[str, Any]:
 
 MINE = at(GOOB, "web/driver", driver("alice", "laptop", you=True))
 DRIVING = State(GOOB_PATH, changed(fleet, MINE), LIVE, logs=logs)
-_ACTS = (
-    ("take", "ann", "phone", "", 1),
-    ("stop", "ann", "phone", "button", 1),
-    ("reset", "bob", "", "", 1),
-    ("release", "ann", "laptop in the hall, on the table", "", 1),
-    ("autonomy", "otto", "laptop", "file apriltag-follow", 1),
-    ("flag", "a-name-that-is-as-long-as-names-may-be", "", "name mqtt-video, on True", 12),
-)
-_ROWS = [
-    {"at": 1_795_341_540 + 11 * n, "ref": GOOB, "address": "10.0.0.7"}
-    | dict(zip(("what", "user", "device", "detail", "count"), act, strict=True))
-    for n, act in enumerate(_ACTS)
-]
 #: May restart robots, and is not logged in.
 OPERATING = replace(
     DRIVING,
@@ -304,7 +287,6 @@ OPERATING = replace(
         "rights": ["drive", "people", "reset", "system", "take"],
         "login": False,
     },
-    audit=[*_ROWS, {**_ROWS[1], "ref": "all"}],
 )
 
 SQUARE = [[0.25, 0.25], [0.75, 0.25], [0.75, 0.75], [0.25, 0.75]]
@@ -375,9 +357,7 @@ STATES: dict[str, State] = {
     "fleet": of("/", BOB_DRIVES),
     "fleet-stopped": of("/", stopped(GOOB, "eve on phone"), stopped(FRED, "eve on phone", why="button, all")),
     "fleet-undriveable": of("/", *UNDRIVEABLE),
-    "undriveable": of(GOOB_PATH, MINE, *UNDRIVEABLE),
-    "fleet-forty": State("/", many(40, 13, 7, 11, video=True), LIVE),
-    "fleet-thousand": State("/", many(1000, 97, 53, 41)),
+    "fleet-thousand": State("/", thousand),
     "fleet-empty": State("/", lambda _now: []),
     "fleet-lost": State("/", fleet, silent=True),
     "driving": DRIVING,
@@ -385,10 +365,6 @@ STATES: dict[str, State] = {
     "recordings": REPLAYING,
     "replay": replace(REPLAYING, path=f"/replay/{GOOB}?at={START + 30_000}"),
     "replay-gap": replace(REPLAYING, path=f"/replay/{GOOB}?at={GAP[0] + 60_000}"),
-    "recordings-none": replace(REPLAYING, days=(200, "[]")),
-    "recordings-failed": replace(REPLAYING, days=(422, "/data/recordings: Permission denied")),
-    "recordings-lost": replace(REPLAYING, days=(200, "[]"), silent=True),
-    "driving-recorded": replace(DRIVING, welcome={"recordings": True}),
     "watching": of(f"{GOOB_PATH}?watch", stopped(FRED, "eve on phone")),
     "free": of(GOOB_PATH),
     "odometry": SENSORS,
@@ -413,13 +389,6 @@ STATES: dict[str, State] = {
     "old-picture": replace(DRIVING, freezes=True),
     "no-picture": of(GOOB_PATH, MINE, at(GOOB, "web/picture", flow("starting")), logs=logs, pictures=False),
     "thin-link": of(GOOB_PATH, MINE, *THIN, logs=logs, pictures=False),
-    "listening": of(GOOB_PATH, MINE, at(GOOB, "web/sound", sound("flowing", talker="bob")), logs=logs),
-    "no-sound": of(
-        GOOB_PATH, MINE, at(GOOB, "web/sound", sound("refused", "its sound cannot be switched on from here")), logs=logs
-    ),
-    "old-page": replace(DRIVING, welcome={"version": "of another server"}),
-    "plain-http": replace(DRIVING, welcome={"drives": False}),
-    "tower": of(f"/r/{TOWER}"),
     "devices": of(GOOB_PATH, MINE, base=devices, repeated={**LIVE, "mcu/lamp-1/glow": 0.2}),
     "devices-viewer": of(GOOB_PATH, base=devices, welcome=VIEWER),
     "no-camera": of(f"/r/{LAMP}"),
@@ -489,8 +458,6 @@ ASKED = changed(
     at(GOOB, "autonomy-status", {"running": False, "timestamp": 1.0, "error": None}, 9000),
 )
 NOT_ARBITRATED = asked(drive={"available": True, "controls": True})
-ENDED = {"running": False, "timestamp": 1.0, "error": "apriltag-follow exited with code 1"}
-BUSY = clip(error="the loudspeaker is busy (talk-back plays)")
 STATES |= {
     "asked": of(GOOB_PATH, MINE, base=ASKED),
     "asked-busy": of(
@@ -500,8 +467,6 @@ STATES |= {
         clip(playing=True, file="speech/number 3.wav"),
         base=ASKED,
     ),
-    "asked-failed": of(GOOB_PATH, MINE, at(GOOB, "autonomy-status", ENDED), BUSY, base=ASKED),
-    "asked-viewer": of(GOOB_PATH, base=ASKED, welcome=VIEWER),
     "script-drives": of(GOOB_PATH, MINE, NOT_ARBITRATED, lambda now: script(now), base=ASKED),
 }
 STATES["map-empty"] = replace(STATES["asked"], values=changed(ASKED, MINE, at(GOOB, "wheel-odometry", {"value": {}})))

@@ -15,10 +15,7 @@ from pebble.extensions.operator.client.broker import Broker as BrokerOfPages
 from pebble.extensions.page.open_components import OpenComponents
 from pebble.extensions.page.robots import Interest, Robots
 from pebble.transports import Message, MqttSettings, QoS, create
-from tests.ext.boards import mcu_wire as wire
 from tests.ext.page.served import Page
-from tests.ext.page.states import described, sample
-from tests.kit.played_robot import RecordingRobot
 from tests.support import Broker, until
 
 
@@ -73,21 +70,6 @@ def test_flags_are_those_of_the_broker(page, robot, broker) -> None:
     publish(broker, f"{robot.base}/incoming/flags/mqtt-video", b'"odd"')
     publish(broker, f"{robot.base}/incoming/flags/mqtt-audio", b"", retain=True)
     assert until(lambda: flags() == {"remote_mirror": None, "mqtt_audio": None, "mqtt_video": True})
-
-
-# -- microcontrollers
-
-
-def test_what_an_mcu_publishes_under_an_alias_arrives(page: Page, robot: RecordingRobot) -> None:
-    page.send("watch", ref=robot.base)
-    robot.publish("mcu/lamp-1/describe", described(wire.LAMP), retain=True)
-    robot.publish("lights/lamp", sample("lamp-1", "lamp", {"level": 62.5}), retain=True)
-    assert until(lambda: page.value(robot.base, "lights/lamp", "value") == {"level": 62.5})
-    assert page.value(robot.base, "mcu/lamp-1/describe", "device_uid") == "lamp-1"
-    robot.publish("lights/other", {"value": 1}, retain=True)
-    robot.publish("mcu/lamp-1/glow", sample("lamp-1", "glow", {"lux": 1.5}))
-    assert until(lambda: page.value(robot.base, "mcu/lamp-1/glow", "value") == {"lux": 1.5})
-    assert page.value(robot.base, "lights/other") is None
 
 
 # -- opened and closed

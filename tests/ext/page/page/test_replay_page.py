@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-import av
 import pytest
 
 from tests.ext.page.browser import Tab
@@ -70,23 +69,6 @@ def test_the_way_to_a_day_and_a_robot(show: Show) -> None:
         assert [one for one in opened.complaints() if "closed before the connection is established" not in one] == []
 
 
-def test_the_bar_shows_what_was_recorded_and_leads_there(replay: Tab) -> None:
-    assert "22 Nov, 10:00:30" in replay.test("badge").inner_text()
-    assert "10:00:29.960" in replay.test("picture-time").inner_text()  # when it was taken
-    bar = replay.test("bar")
-    for _ in ("the day", "this session only"):
-        box = bar.bounding_box()
-        since, until = (float(bar.get_attribute(name) or 0) for name in ("min", "max"))
-        assert box is not None
-        replay.page.mouse.click(box["x"] + 8 + (box["width"] - 16) / 5, box["y"] + box["height"] / 2)
-        assert replay.until(lambda: abs(position(replay) - (since + (until - since) / 5)) < (until - since) / 50)  # noqa: B023
-        replay.test("near").click()
-    assert START - 10_000 <= since < until <= GAP[0] + 10_000
-    assert replay.page.locator(".player-marks > .drive").count() == 1
-    seek(replay, AT + 12_345)
-    assert replay.until(lambda: replay.page.url.endswith(f"/replay/{ROBOT}?at={AT + 12_345}"))
-
-
 def test_the_cards_show_that_time_and_none_of_them_sends(replay: Tab) -> None:
     cards = replay.page.locator("[data-card]").evaluate_all("(all) => all.map((one) => one.dataset.card)")
     assert {"telemetry", "map", "plots", "logs", "values"} <= set(cards)
@@ -109,19 +91,6 @@ def test_the_sound_of_then_is_heard_also_after_a_seek(replay: Tab) -> None:
     seek(replay, AT + 3000)
     assert replay.until(f"!({heard})")
     assert replay.until(heard)
-
-
-def test_a_film_is_taken_home(replay: Tab) -> None:
-    for name in ("open-download", "mark-in"):
-        replay.test(name).click()
-    seek(replay, AT + 3000)
-    assert shown(replay, AT + 3000)
-    for name in ("mark-out", "download"):
-        replay.test(name).click()
-    with replay.page.expect_download() as saved:
-        replay.test("download-file").click(timeout=60_000)
-    with av.open(saved.value.path()) as film:
-        assert sum(1 for _ in film.decode(video=0)) > 10
 
 
 def test_seeks_leave_nothing_behind(show: Show, server: CannedServer) -> None:
