@@ -16,7 +16,10 @@ import zlib
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AbstractContextManager, asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import cache
 from importlib.resources import files
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import msgspec
@@ -42,6 +45,7 @@ from pebble.extensions.page.shown import shown
 from pebble.extensions.page.static_files import StaticFiles
 from pebble.transports import MqttSettings
 from tests.ext.page.browser import Size, Tab, tab
+from tests.ext.recordings.seek.test_archive import film
 from tests.support import ROOT, WAIT_S, free_port, until
 
 PING_S = 0.5
@@ -72,7 +76,7 @@ class State:
     still: bool = False  # cameras show flat colours, and a few pictures only
     at: int = 0  # ms epoch, at which the server's time stands still; 0: it does not
     logs: Callable[[int], list[Any]] = field(default=lambda _now: [])  # lines of the component that is open
-    recordings: bool = False  # those of tests.ext.page.recorded are offered
+    recordings: bool = False  # of goob a minute is recorded
 
 
 class CannedServer:
@@ -127,9 +131,7 @@ class CannedServer:
         """What pages that connect from now on are shown."""
         self.state = state
         if state.recordings and self._app.state.recordings is None:
-            from tests.ext.page.recorded import folder  # which needs the states, and these this module
-
-            self._app.state.recordings = recordings.Recordings(folder())
+            self._app.state.recordings = recordings.Recordings(Path(_recorded().name))
         self.received.clear()
         self.posted.clear()
 
@@ -268,6 +270,14 @@ class CannedServer:
                 await websocket.send_bytes(struct.pack(">IB", number, 0) + packet)
                 await websocket.receive_bytes()  # drawn
                 await asyncio.sleep(PICTURE_S)
+
+
+@cache
+def _recorded() -> TemporaryDirectory[str]:
+    """Make recordings for all tests of this process, with which they are removed."""
+    made = TemporaryDirectory(prefix="pebble-recorded-")
+    film(Path(made.name), "json", 60)
+    return made
 
 
 def _headers() -> dict[str, str]:

@@ -11,7 +11,6 @@ from playwright.sync_api import Browser, Page
 
 from tests.ext.page.browser import Size, Tab, Theme
 from tests.ext.page.canned import CannedServer, Show
-from tests.ext.page.fingers import REACHED
 from tests.ext.page.looks import LOOKS, Act, check, nothing, press, taken
 from tests.ext.page.states import (
     FRED,
@@ -78,23 +77,18 @@ ALL: tuple[Size, ...] = ("desktop", "phone", "landscape")
 WHOLE = ("driving", "taken", "others-ask", "stopped", "lost", "silent", "no-camera")  # looked at in all sizes
 #: Text that shows that a state has been reached, where it takes a while.
 WHEN = {
-    "recordings": "Sunday, 22 November 2026",
+    "recordings": "Tuesday, 14 November 2023",
     "map-silent": "goob is silent since",
     "fleet-stopped": "2 stopped",
-    "fleet-undriveable": "Cannot be driven: serial",
     "fleet-lost": "No connection to the server since",
     "lost": "No connection to the server since",
-    "others-drive": "Someone else drives, too",
     "stopped": "Also stopped",
     "stop-sent": "NOT CONFIRMED by goob, and sent again",
     "stop-old": "cannot be held",
     "not-confirmed": "NOT CONFIRMED",
-    "one-broker": "broker spare.lab:8884 refused us",
     "silent": "goob is silent since",
     "old-picture": "The picture is ",
     "no-picture": "There is no picture yet",
-    "thin-link": "Pictures wait for driving",
-    "other-camera": "seen from tower-1",
 }
 _MORE, _SOUND = press("[data-test=tab-more]"), press("[data-test=tab-sound]")
 DESKTOP: tuple[Size, ...] = ("desktop",)
@@ -124,7 +118,7 @@ SCREENS = [
     *(Screen(f"gear-{name}", name, press("[data-test=gear]"), DESKTOP) for name in ("stopped", "script-drives")),
     Screen("replay-timeline", "replay", _timeline, ("landscape", "small")),
     Screen("replay-days", "replay", _timeline, hold=press("[data-test=open-days]")),
-    Screen("replay-marked", "replay-gap", _timeline, hold=press("[data-test=open-download]", "[data-test=mark-in]")),
+    Screen("replay-marked", "replay", _timeline, hold=press("[data-test=open-download]", "[data-test=mark-in]")),
 ]
 CASES = [(screen, size) for screen in SCREENS for size in screen.sizes]
 
@@ -153,7 +147,7 @@ def _wait(opened: Tab, text: str) -> None:
     shown = f"() => !!window.pebble?.connection.you && document.body.innerText.includes({text!r})"
     assert opened.until(shown), f"{text!r} is not shown"
     opened.until("() => !location.pathname.startsWith('/replay/') || pebble.replay?.isHere", 10)
-    if text not in ("There is no picture yet", "Pictures wait for driving", "goob is silent since"):
+    if text not in ("There is no picture yet", "goob is silent since"):
         opened.until("() => !pebble.video.ref || !!pebble.video.info", 5)
 
 
@@ -204,6 +198,17 @@ _OUT_OF_BAR = """() => [...document.querySelectorAll(".picture-bar :is(button, l
   .filter((one) => one.getBoundingClientRect().right > one.closest(".picture-bar").getBoundingClientRect().right)
   .map((one) => `out of its bar: ${one.outerHTML.slice(0, 120)}`)"""
 _TOO_WIDE = "() => document.documentElement.scrollWidth > innerWidth"
+
+
+#: Where STOP lies, and what somebody may need at once but cannot press: something else lies over it.
+REACHED = """(() => {
+  const middle = (one, { x, y, width, height } = one.getBoundingClientRect()) => [x + width / 2, y + height / 2];
+  const top = (one) => document.elementFromPoint(...middle(one));
+  const urgent = [...document.querySelectorAll(".top .stop, .banner button, [data-test=take]")];
+  const shown = urgent.filter((one) => one.checkVisibility());
+  const covered = shown.filter((one) => top(one) && !one.contains(top(one))).map((one) => one.innerText);
+  return [[...document.querySelectorAll(".top .stop")].map((one) => middle(one).map(Math.round)), covered];
+})()"""
 
 
 def _measured(page: Page, size: Size) -> list[str]:
