@@ -12,7 +12,6 @@ from msgspec.structs import replace
 
 from pebble import contract as c
 from pebble.contract import OUTGOING, codec
-from pebble.contract.payloads import AnyObject
 from pebble.errors import PayloadError, PebbleError
 from pebble.extensions.operator.client.broker import Broker
 from pebble.extensions.operator.client.robot_topics import FLAGS, PLACES, WATCHED
@@ -29,7 +28,7 @@ STEP_S = 1.0  # between two changes of what is received of one component: capabi
 
 
 class _Meaning(NamedTuple):
-    """The component and channel of a topic whose name does not show them: flags, aliases, and renamed topics."""
+    """The component and channel of a topic whose name does not show them: flags and renamed topics."""
 
     ref: str
     channel: c.Channel
@@ -144,15 +143,12 @@ class OpenComponents:
 
         def take(message: Message, now: float) -> None:
             meaning = self._wanted.get(ref, {}).get(filter_)  # None: the topic's name shows component and channel
-            aliases_before = self._robots.aliases(ref)
             if meaning is None:
                 self._robots.receive(message, now)
             elif meaning.channel.kind is c.Kind.FLAG:
                 self._receive_flag(ref, meaning.channel, message)
             else:
                 self._robots.receive_as(meaning.ref, meaning.channel.metric, message, now, meaning.channel)
-            if self._robots.aliases(ref) != aliases_before:  # it was a manifest, with other topics to subscribe to
-                self.update(ref)
 
         return take
 
@@ -177,9 +173,6 @@ class OpenComponents:
         filters: _Filters = {channel.filter(ref): None for channel in WATCHED}  # None: the names tell the meaning
         for channel in _NAMED:
             self._add(filters, ref, channel)
-        for metric in self._robots.aliases(ref):
-            alias = c.Channel(metric=metric, kind=c.Kind.STREAM, payload=AnyObject)
-            filters.setdefault(f"{ref}/{OUTGOING}/{metric}", _Meaning(ref, alias))
         for flag in FLAGS.values():
             filters[self._robots.topic(ref, flag)] = _Meaning(ref, flag)
         source = self._robots.sources.get(ref, ref)

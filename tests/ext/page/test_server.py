@@ -18,12 +18,10 @@ from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.extensions.page import robots as robots_module
 from pebble.extensions.page.drive.driven_robot import Tab
 from pebble.extensions.page.log_lines import MAX_BYTES, MAX_LINE_BYTES, MAX_LINES, PART_BYTES, LogLines, line_of
-from pebble.extensions.page.robots import MAX_ALIASES, Interest, Robots
+from pebble.extensions.page.robots import Interest, Robots
 from pebble.extensions.page.server import Server
 from pebble.extensions.page.setting import WebSettings
 from pebble.transports import Message, MqttSettings
-from tests.ext.boards import mcu_wire as wire
-from tests.ext.page.states import described
 
 _CAPABILITIES = {"t": 1, "value": {"drive": {"available": True}, "estop": {"available": True, "owners": ["serial"]}}}
 
@@ -163,29 +161,6 @@ def test_large_values_are_sent_one_at_a_time() -> None:
 DESCRIBE = "mcu/lamp-1/describe"
 
 
-def manifest(*channels: Any) -> dict[str, Any]:
-    interfaces = [{"name": f"i{n}", "dir": "out", "channel": channel} for n, channel in enumerate(channels)]
-    return described(wire.LAMP) | {"interfaces": interfaces}
-
-
-#: What is defined elsewhere, or cannot be a part of a topic.
-NO_ALIASES = [
-    "", 1, None, {"a": 1}, "front-camera", "logs", "estop/base", "estops", "control/x", "by/x", "web/estop", "web",
-    "mcu/other/lamp", "a/#", "a/+/b", "/a", "a//b", "$SYS", "a\0b", "a" * 65, "/".join(["a" * 30] * 8),
-]  # fmt: skip
-
-
-def test_only_a_free_channel_becomes_an_alias() -> None:
-    def aliases(channel: Any) -> list[str]:
-        robots = Robots()
-        robots.receive(published(GOOB, DESCRIBE, manifest(channel, channel)), 1.0)
-        return robots.aliases(GOOB)
-
-    assert [one for one in NO_ALIASES if aliases(one)] == []
-    # the first one is the contract's in the other direction only: nothing arrives there
-    assert [aliases(one) for one in ("drive-values", "a/b")] == [["drive-values"], ["a/b"]]
-
-
 FIELD = {"name": "x", "type": "u8"}
 INTERFACE = {"name": "a", "dir": "out", "encoding": {"fields": [FIELD]}}
 BARE = {"model": "", "firmware_version": "", "interfaces": []}
@@ -246,26 +221,6 @@ def test_whatever_a_robot_publishes_pages_get_json(metric: str) -> None:
     for payload in ODD:
         robots.receive(published(GOOB, metric, payload), 1.0)
         json.loads(bytes(robots.value(GOOB, metric) or b"null"), parse_constant=pytest.fail, parse_int=str)
-
-
-def test_there_is_an_end_to_aliases() -> None:
-    robots = Robots()
-    for device in range(4):
-        many = manifest(*(f"x/{device}-{n}" for n in range(100)))
-        robots.receive(published(GOOB, f"mcu/m{device}/describe", many), 1.0)
-    assert len(robots.aliases(GOOB)) == MAX_ALIASES
-
-
-def test_aliases_end_with_their_manifest() -> None:
-    robots = Robots()
-    interest = Interest(lambda: None)
-    robots.join(interest)
-    robots.watch(interest, GOOB)
-    robots.receive(published(GOOB, DESCRIBE, manifest("a/b")), 1.0)
-    assert [value[:2] for value in robots.take(interest, 2.0, large=False)[0]] == [(GOOB, DESCRIBE)]
-    robots.receive(published(GOOB, DESCRIBE, b""), 1.0)
-    assert robots.aliases(GOOB) == []
-    assert robots.take(interest, 3.0, large=False) == (((GOOB, DESCRIBE, None, 0.0),), False)
 
 
 # -- log lines
