@@ -55,13 +55,9 @@ class OpenComponents:
         broker: Broker,
         robots: Robots,
         spawn: Callable[[Coroutine[Any, Any, None]], None],
-        *,
-        keep_s: float = KEEP_S,
-        step_s: float = STEP_S,
     ) -> None:
-        """Store the arguments. ``spawn`` runs a coroutine in the background; for the times see KEEP_S and STEP_S."""
+        """Store the arguments. ``spawn`` runs a coroutine in the background."""
         self._broker, self._robots, self._spawn = broker, robots, spawn
-        self._keep_s, self._step_s = keep_s, step_s
         self._pages: Counter[str] = Counter()  # by component: how many have it open
         self._subscriptions: dict[str, dict[str, Subscription]] = {}  # by component and filter
         self._following: set[str] = set()  # components whose task, _follow, runs
@@ -82,7 +78,7 @@ class OpenComponents:
         self.update(ref)
 
     def close(self, ref: str) -> None:
-        self._broker.loop.call_later(self._keep_s, self._closed, ref)
+        self._broker.loop.call_later(KEEP_S, self._closed, ref)
 
     def _closed(self, ref: str) -> None:
         """Note that a page was closed. It is called after a delay, so that a reloaded page still finds everything."""
@@ -122,7 +118,7 @@ class OpenComponents:
                         continue
                     self._forget(ref)
                     return
-                await asyncio.sleep(self._step_s)  # the least time between two changes
+                await asyncio.sleep(STEP_S)  # the least time between two changes
                 if ref in self._pages and self._filters(ref).keys() == subscriptions.keys():
                     return  # nothing has changed meanwhile, and nothing failed
         finally:
