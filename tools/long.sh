@@ -46,7 +46,7 @@ schedules) # the shortest schedule that violates a rule is printed, or the seed 
     ;;
 page) $python -m pytest --workers 8 -m page --ignore tests/ext/page/test_engines.py tests/ext/page ;;
 engines) $python -m pytest -ra -m page tests/ext/page/test_engines.py ;;
-looks) $python -m tests.ext.page.looks ;;
+looks) PEBBLE_LOOKS=store $python -m pytest -m page -k looks_as_it_is_stored tests/ext/page/page/test_look.py ;;
 fleet) tests --workers 2 --timeout 900 -s tests/ext/fleet ;;
 brokers)
     sh tests/ext/checks/brokers/install.sh

@@ -19,17 +19,6 @@ from tests.support import SOON_S, WAIT_S
 Wheels = tuple[int, int]
 
 FORWARD, BACK, LEFT, RIGHT, REST = (1, 1), (-1, -1), (-1, 1), (1, -1), (0, 0)
-#: Key, and what the wheels do: their signs, left and right.
-KEYS: dict[str, Wheels] = {
-    "KeyW": FORWARD,
-    "KeyS": BACK,
-    "KeyA": LEFT,
-    "KeyD": RIGHT,
-    "ArrowUp": FORWARD,
-    "ArrowDown": BACK,
-    "ArrowLeft": LEFT,
-    "ArrowRight": RIGHT,
-}
 QUIET_S = 0.4  # so long nothing may turn where nothing may turn: eight commands of a gesture
 _PRESSES = 6
 _MOVES_S = 3.0

@@ -106,6 +106,13 @@ def test_capabilities_may_name_another_topic_of_the_same_robot(fields: dict[str,
         assert published(fields, {section.partition(".")[0]: odd}).topic == usual
 
 
+def test_spellings_of_where_an_action_goes() -> None:
+    topic, again = f"{BASE}/incoming/flags/again", {"op": "action", "name": "service-restart"}
+    for system in ({"service-restart": {"flag_topic": topic}}, {"service_restart": {"topic": topic}}):
+        assert published(again, {"system": system}).topic == topic
+    assert published(again, {"service_restart": {"flag_topic": topic}}).topic == topic
+
+
 def test_which_right_is_needed() -> None:
     for fields, *_ in PUBLISHED:
         needs_system = fields["op"] == "action" or fields.get("name") == "remote-mirror"

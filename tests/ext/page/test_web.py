@@ -24,7 +24,6 @@ from pebble.errors import ConfigError
 from pebble.extensions.fleet.audit import Audit
 from pebble.extensions.fleet.people import People
 from pebble.extensions.fleet.roles import Role
-from pebble.extensions.page import run as process
 from pebble.extensions.page.setting import WebSettings, settings_of
 from tests.commands.command_line import Run, config_file, program
 from tests.kit.terminal import Terminal
@@ -296,15 +295,6 @@ def test_settings(web: dict[str, Any], more: dict[str, Any], expected: dict[str,
 def test_a_missing_broker_is_named() -> None:
     assert problem({}).startswith("web_interface.mqtt.host: is missing, and so is services.mqtt_bridge.remote_mqtt")
     assert 'the robot\'s own connection is "zenoh"' in problem({}, **ZENOH)
-
-
-def test_users_that_cannot_be_read_hide_no_other_problem(tmp_path: Path) -> None:
-    raw = {"robot": {"id": "goob"}, "web_interface": {"host": "0.0.0.0", "people": str(tmp_path)}, **REMOTE}
-    with pytest.raises(ConfigError) as caught:
-        process.settings_or_all_problems(parse(raw, folder=tmp_path, env={}))
-    first, second = caught.value.problems
-    assert first.startswith("web_interface.host: other machines reach 0.0.0.0")
-    assert second.startswith(f"{tmp_path}: ")
 
 
 def test_a_certificate_needs_its_files(tmp_path: Path) -> None:

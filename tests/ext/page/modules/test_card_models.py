@@ -227,7 +227,7 @@ MAY: Rows = {
 cards = Script(
     {
         "core/stream.js": "refusal",
-        "ui/cards/manifest.js": "command, range, step, unsendable",
+        "ui/cards/manifest.js": "range, step, unsendable",
         "ui/cards/outlets.js": "outletsOf, obstacle",
         "ui/parts/models.js": "Offers",
     }
@@ -240,12 +240,6 @@ def of(expression: str, *values: Any) -> str:
 
 
 PRIVATE = wire.M("m", (wire.I(1, "a", wire.IN, wire.KIND_COMMAND, (wire.F("x", wire.U8),), flags=wire.LOCAL_ONLY),))
-#: Fields, what is entered, and the value of the field's type.
-ENTERED: list[tuple[dict[str, Any], Any, Any]] = [
-    ({"type": "bool"}, True, True),
-    ({"type": "bool"}, None, False),
-    ({"type": "f32"}, "1.5e3", 1500),
-]
 #: Fields, and the least and the greatest value, and the step.
 RANGES: list[tuple[dict[str, Any], Any, str]] = [
     *[({"type": f"u{bits}"}, [0, 2**bits - 1], "1") for bits in (8, 16, 32)],
@@ -254,12 +248,6 @@ RANGES: list[tuple[dict[str, Any], Any, str]] = [
     ({"type": "u8", "scale": 3}, [0, 765], "3"),
     ({"type": "i16", "scale": -0.1, "offset": 10}, [-3266.7, 3286.8], "any"),
     ({"type": "f32"}, None, "any"),
-]
-#: What capabilities list of *drive*, and whether there are controls for an axis besides turning and going.
-AXES: list[tuple[Any, bool]] = [
-    ({"drive": {"available": True, "axes": ["x", "z"]}}, False),
-    ({"drive": {"available": True}}, True),  # it does not list them: it may have any
-    (None, True),  # no capabilities
 ]
 OFFERED = {"value": {"outlets": {"available": True, "outlets": [{"name": "o1", "controls": False}, {"name": "o2"}]}}}
 #: Capabilities, metrics, and the outlets, and whether each can be switched.
@@ -296,15 +284,9 @@ CARDS: Rows = {
     **{f"what takes commands has fields of known types: {kind}": (
         of("unsendable(v[0])", {"encoding": {"fields": [{"name": "x", "type": kind}]}}), why)
         for kind, why in {**dict.fromkeys(("bool", "f32", "u8"), ""), "f64": "x is of an unknown type"}.items()},
-    **{f"controls for an extra axis: {value}": (
-        of("new Offers('pebble/robots/a', v[0]).hasExtraAxis", value and {"value": value}), expected)
-        for value, expected in AXES},
     **{f"outlets are those that are listed and those that report: {metrics}": (of("""Object.fromEntries(
         outletsOf(new Offers('pebble/robots/a', v[0], v[1])).map(({ name, controls }) => [name, controls]))""",
         capabilities, metrics), expected) for capabilities, metrics, expected in OUTLETS},
-    **{f"what is entered becomes JSON of the field's type: {field} {entered}": (of(
-        "command(v[0], new Map(v[1])).x", {"encoding": {"fields": [field | {"name": "x"}]}}, [["x", entered]]), value)
-        for field, entered, value in ENTERED},
     **{f"what a field can hold: {field}": (of("[range(v[0]), step(v[0])]", field), [limits, step])
         for field, limits, step in RANGES},
     **{f"why {name[:8]} {controls} {report} cannot be switched": (

@@ -400,15 +400,6 @@ def test_no_panel_covers_a_part_of_what_stops_or_takes(
         assert [(what, one) for what, found in problems.items() for one in found] == []
 
 
-def test_a_small_phone_shows_all_that_drives_at_once(show: Show) -> None:
-    with show(STATES["driving"], "phone", viewport={"width": 360, "height": 640}) as opened:
-        _ready(opened)
-        box = "document.querySelector('{}').getBoundingClientRect().{}".format
-        for name in ("stick", "speed", "release", "video"):
-            assert opened.page.evaluate(f"{box(f'[data-test={name}]', 'bottom')} <= {box('.tabs', 'top')} + 1"), name
-        assert opened.page.evaluate(box("[data-test=stick]", "width")) >= 150
-
-
 @pytest.mark.parametrize("name", LOOKS)
 def test_a_state_looks_as_it_is_stored(server: CannedServer, browser: Browser, name: str) -> None:
     check(name, taken(server, browser, LOOKS[name]))
