@@ -1,4 +1,4 @@
-"""How robots look to people, where their cards are, their log lines, and notices; in Node.js and virtual time."""
+"""How robots look to people, their log lines, and notices; in Node.js and virtual time."""
 
 from __future__ import annotations
 
@@ -56,37 +56,6 @@ FACES: Rows = {
 # fmt: on
 
 
-# -- where cards are placed, by how high they are
-
-#: ``cards``: their names and rows of 4 px, in a main column and, if it is another height, in the last one.
-columns = Script(
-    {"ui/robot/columns.js": "placed"},
-    """
-    const STAGE = ["picture", 164, 164, { span: "main" }], DRIVE = ["drive", 165, 165, { side: true }];
-    const END = ["engineers", 30, 30, { span: "all" }];
-    const at = (count, cards, hasSide = true, homes) => {
-      const sizes = cards.map(([id, rows, sideRows = rows, more]) => ({ id, rows, sideRows, ...more }));
-      const places = placed(sizes, count, hasSide, homes && new Map(Object.entries(homes)));
-      return Object.fromEntries(places.map((place, n) => [sizes[n].id, place]).slice(hasSide ? 2 : 0, -1));
-    };
-    """,
-)
-PLOTS = '["plots", 92, 146, { wide: true }]'
-STATE, MAP = '["state", 68]', '["map", 108]'
-
-# fmt: off
-COLUMNS: Rows = {
-    "a card goes where the columns end most alike": (
-        f"result = at(2, [STAGE, DRIVE, {STATE}, {MAP}, END]);", {"state": [165, 1, 1], "map": [164, 0, 1]}),
-    "what is wide spans columns that would stay empty": (
-        f"result = at(3, [STAGE, DRIVE, {STATE}, {PLOTS}, END]);", {"state": [165, 2, 1], "plots": [164, 0, 2]}),
-    "a card keeps its column, and what is below it moves": (
-        f"result = at(2, [STAGE, DRIVE, {STATE.replace('68', '200')}, {MAP}, END], true,"
-        "{ state: [[0, 1]], map: [[0, 1]] });", {"state": [164, 0, 1], "map": [364, 0, 1]}),
-}
-# fmt: on
-
-
 # -- log lines
 
 _BOOK = """
@@ -131,11 +100,9 @@ lacks = Script({"ui/cards/system.js": "lacks"})
 LACKS: list[tuple[str, Any, str]] = [
     ("reboot", None, ""),
     ("reboot", {}, NOT_OFFERED),
-    ("reboot", {"reboot": False}, NOT_OFFERED),
     ("reboot", {"system": {"reboot": {"available": True, "controls": True}}}, ""),
     ("reboot", {"system": {"reboot": {"available": True, "controls": False}}}, NO_COMMAND),
     ("reboot", {"system": {"reboot": {"available": False, "controls": False}}}, NOT_OFFERED),
-    ("reboot", {"reboot": {"controls": False}}, NO_COMMAND),
     ("git-pull", {"system": {"git_pull": {"controls": False}}}, NO_COMMAND),
 ]
 LACKING: Rows = {
@@ -214,7 +181,7 @@ NOTICES: Rows = {
 # fmt: on
 
 
-@rows((looks, FACES), (columns, COLUMNS), (book, BOOK), (lacks, LACKING), (notices, NOTICES))
+@rows((looks, FACES), (book, BOOK), (lacks, LACKING), (notices, NOTICES))
 def test_each(found: Callable[[], Any], expected: Any) -> None:
     assert found() == expected
 
