@@ -109,7 +109,6 @@ class CannedServer:
         app.state.settings = WebSettings(broker=MqttSettings(host="127.0.0.1"))
         app.state.audit = Audit(None)
         app.state.recordings = None
-        app.state.recognise = lambda _client, _user: None
         self._app = app
         config = uvicorn.Config(app, "127.0.0.1", self.port, log_level="critical", ws_per_message_deflate=False)
         self._server = uvicorn.Server(config)
