@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import pytest
 from playwright.sync_api import Browser
 
-from tests.ext.page.console import Console, Wire, console, used
+from tests.ext.page.attacker import Everything
+from tests.ext.page.console import Console, console, used
 from tests.ext.page.stage import Stage
 
 
@@ -18,8 +19,8 @@ def stage() -> Iterator[Stage]:
 
 
 @pytest.fixture(scope="module")
-def wire(stage: Stage) -> Iterator[Wire]:
-    running = Wire(stage)
+def wire(stage: Stage) -> Iterator[Everything]:
+    running = Everything(stage.broker_port)
     yield running
     running.close()
 

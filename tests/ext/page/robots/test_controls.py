@@ -7,9 +7,10 @@ from collections.abc import Callable
 import pytest
 from playwright.sync_api import Browser, Locator
 
+from tests.ext.page.attacker import Everything
 from tests.ext.page.browser import tab
 from tests.ext.page.canned import CannedServer
-from tests.ext.page.console import Console, Wire, console
+from tests.ext.page.console import Console, console
 from tests.ext.page.stage import Stage
 from tests.ext.page.states import STATES
 
@@ -19,7 +20,7 @@ pytestmark = pytest.mark.alone  # deadlines are checked
 # -- stops
 
 
-def test_the_space_bar_ends_the_gesture_and_latches_nothing(at_lamp: Console, wire: Wire) -> None:
+def test_the_space_bar_ends_the_gesture_and_latches_nothing(at_lamp: Console, wire: Everything) -> None:
     assert at_lamp.drive()
     at_lamp.page.keyboard.press("Space")
     assert at_lamp.rests()
@@ -53,7 +54,7 @@ STOPS: dict[str, Callable[[Console], None]] = {
 
 
 @pytest.mark.parametrize("how", STOPS)
-def test_a_stop_latches_the_robot_which_stays_at_rest(at_lamp: Console, wire: Wire, how: str) -> None:
+def test_a_stop_latches_the_robot_which_stays_at_rest(at_lamp: Console, wire: Everything, how: str) -> None:
     assert at_lamp.drive()
     STOPS[how](at_lamp)
     assert at_lamp.tab.until(lambda: wire.latched("minilamp"))
@@ -64,7 +65,9 @@ def test_a_stop_latches_the_robot_which_stays_at_rest(at_lamp: Console, wire: Wi
     assert at_lamp.stays_at_rest()
 
 
-def test_stop_all_latches_every_robot_and_each_is_reset_by_itself(stage: Stage, at_lamp: Console, wire: Wire) -> None:
+def test_stop_all_latches_every_robot_and_each_is_reset_by_itself(
+    stage: Stage, at_lamp: Console, wire: Everything
+) -> None:
     assert at_lamp.drive()
     at_lamp.test("stop-all").click()
     assert at_lamp.tab.until(lambda: all(wire.latched(name) for name in stage.robots))

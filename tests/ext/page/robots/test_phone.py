@@ -8,8 +8,9 @@ from contextlib import contextmanager
 import pytest
 from playwright.sync_api import Browser
 
+from tests.ext.page.attacker import Everything
 from tests.ext.page.browser import Size, Tab, Theme
-from tests.ext.page.console import BACK, FORWARD, LEFT, RIGHT, Console, Wheels, Wire, console, used
+from tests.ext.page.console import BACK, FORWARD, LEFT, RIGHT, Console, Wheels, console, used
 from tests.ext.page.stage import Stage
 
 pytestmark = pytest.mark.page  # deadlines are checked
@@ -102,7 +103,7 @@ def test_the_stick_follows_a_finger_until_it_is_lifted(
 # -- a second finger
 
 
-def test_a_second_finger_on_stop_latches(at_lamp: Phone, wire: Wire) -> None:
+def test_a_second_finger_on_stop_latches(at_lamp: Phone, wire: Everything) -> None:
     assert at_lamp.drive_by_stick()
     at_lamp.touch("stop-one")
     assert at_lamp.tab.until(lambda: wire.latched("minilamp"))
