@@ -39,6 +39,7 @@ const page = {
   store: { get: (at, metric) => (metric in (values[at] ?? {}) ? { value: values[at][metric] } : undefined) },
   commands: {
     setLights: (_ref, colour) => sent.push(colour),
+    playSound: (_ref, file, repeat) => sent.push([file, repeat]),
   },
 };
 """
@@ -92,6 +93,30 @@ LIGHTS: Rows = {
         result = [toggleFlash(page, ref), one.mode, toggleFlash(page, ref)];""", ["", "off", "goob is silent"]),
     **{f"why lights do not flash: {change}": (f"{change}; result = [toggleFlash(page, ref), sent];", [why, []])
         for change, why in WHY_NO_FLASH.items()},
+}
+# fmt: on
+
+# -- sounds
+
+sounds = Script({"ui/cards/sounds-model.js": "grouped, play, repeatLast"}, _STORED + _PAGE, anew=True)
+FILES = ["horn.wav", "Bell.wav", "animals/Cat.wav", "animals/dog.wav", "animals/wild/cat.wav"]
+WILD = ["animals/wild/", FILES[4:]]
+#: What is searched, how many are shown at most, and the groups; and how many more there are.
+GROUPS = [
+    ("", 60, [["", FILES[:2]], ["animals/", FILES[2:4]], WILD], 0),
+    ("CAT", 60, [["animals/", FILES[2:3]], WILD], 0),
+    ("  wild   cat ", 60, [WILD], 0),
+    ("", 2, [["", FILES[:2]]], 3),
+]
+# fmt: off
+SOUNDS: Rows = {
+    "the last sound is repeated as it was played": ("""
+        result = [repeatLast(page, ref), play(page, ref, "a/horn.wav", true), repeatLast(page, ref),
+          repeatLast(page, "pebble/robots/fred"), sent];""",
+        ["Play one sound first", "", "", "Play one sound first", [["a/horn.wav", True]] * 2]),
+    **{f"{most} clips with '{words}' are grouped by folder": (
+        f"result = grouped({json.dumps(FILES)}, '{words}', {most});", {"folders": folders, "more": more})
+        for words, most, folders, more in GROUPS},
 }
 # fmt: on
 
@@ -273,6 +298,6 @@ CARDS: Rows = {
 # fmt: on
 
 
-@rows((lights, LIGHTS), (forms, FORMS), (may, MAY), (cards, CARDS))
+@rows((lights, LIGHTS), (sounds, SOUNDS), (forms, FORMS), (may, MAY), (cards, CARDS))
 def test_each(found: Callable[[], Any], expected: Any) -> None:
     assert found() == expected

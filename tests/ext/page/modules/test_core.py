@@ -283,6 +283,12 @@ PRESSES = {
 }
 # fmt: off
 ACTIONS: Rows = {
+    "what is not held is done each time": ('key("KeyF"); key("KeyF");', [["flash", "down"]] * 2),
+    "only the speed is repeated":
+        ('key("NumpadAdd", { key: "+", repeat: true }); key("KeyF", { repeat: true });', [["faster", "down"]]),
+    "keys are named as they are printed": ("""
+        const azerty = new Map([["KeyW", "z"]]); result = [keyName("KeyW", azerty), keyName("KeyW"),
+        keyName("ArrowUp", azerty), buttonName(3, true), buttonName(3, false)];""", ["Z", "W", "↑", "Y", "button 4"]),
     **{f"what {press} does": (press, [[action, "down"]]) for press, action in PRESSES.items()},
     "what is held ends with a gesture and a repetition does not begin it again": (
         'key("KeyT"); actions.clear(); key("KeyT", { repeat: true }); actions.keyUp("KeyT"); key("KeyF");',

@@ -1,4 +1,4 @@
-"""How robots look to people, their log lines, and notices; in Node.js and virtual time."""
+"""How robots look to people, where their cards are, their log lines, and notices; in Node.js and virtual time."""
 
 from __future__ import annotations
 
@@ -56,6 +56,37 @@ FACES: Rows = {
 # fmt: on
 
 
+# -- where cards are placed, by how high they are
+
+#: ``cards``: their names and rows of 4 px, in a main column and, if it is another height, in the last one.
+columns = Script(
+    {"ui/robot/columns.js": "placed"},
+    """
+    const STAGE = ["picture", 164, 164, { span: "main" }], DRIVE = ["drive", 165, 165, { side: true }];
+    const END = ["engineers", 30, 30, { span: "all" }];
+    const at = (count, cards, hasSide = true, homes) => {
+      const sizes = cards.map(([id, rows, sideRows = rows, more]) => ({ id, rows, sideRows, ...more }));
+      const places = placed(sizes, count, hasSide, homes && new Map(Object.entries(homes)));
+      return Object.fromEntries(places.map((place, n) => [sizes[n].id, place]).slice(hasSide ? 2 : 0, -1));
+    };
+    """,
+)
+PLOTS = '["plots", 92, 146, { wide: true }]'
+STATE, MAP = '["state", 68]', '["map", 108]'
+
+# fmt: off
+COLUMNS: Rows = {
+    "a card goes where the columns end most alike": (
+        f"result = at(2, [STAGE, DRIVE, {STATE}, {MAP}, END]);", {"state": [165, 1, 1], "map": [164, 0, 1]}),
+    "what is wide spans columns that would stay empty": (
+        f"result = at(3, [STAGE, DRIVE, {STATE}, {PLOTS}, END]);", {"state": [165, 2, 1], "plots": [164, 0, 2]}),
+    "a card keeps its column, and what is below it moves": (
+        f"result = at(2, [STAGE, DRIVE, {STATE.replace('68', '200')}, {MAP}, END], true,"
+        "{ state: [[0, 1]], map: [[0, 1]] });", {"state": [164, 0, 1], "map": [364, 0, 1]}),
+}
+# fmt: on
+
+
 # -- log lines
 
 _BOOK = """
@@ -71,6 +102,8 @@ book = Script({"core/logs.js": "LogBook, MOST"}, _BOOK, "result ??= texts();")
 
 # fmt: off
 BOOK: Rows = {
+    "gaps are seen through every filter":
+        ("take(1, 'a'); take(3, 'b'); result = texts({ search: 'nothing' });", ["… 1 line was dropped"]),
     "lines are taken once": (
         "take(1, 'a', 'b'); take(2, 'b', 'c'); take(1, 'a'); result = [texts(), book.cut];", [["a", "b", "c"], False]),
     "missing numbers are shown": (
@@ -137,6 +170,9 @@ DRIVEABLE = {
 }
 # fmt: off
 NOTICES: Rows = {
+    "a contact of its charger that flaps is no charge": (
+        "for (const charging of [false, true, true, false, true, false, false]) level([12, charging], [11, charging]);"
+        "result = notices.fresh.length;", 1),
     "changes are listed":
         ("online('a', true, false); online('b', false, true);", ["b is online again", "a is offline"]),
     "of each robot the newest is listed": ("""
@@ -181,7 +217,7 @@ NOTICES: Rows = {
 # fmt: on
 
 
-@rows((looks, FACES), (book, BOOK), (lacks, LACKING), (notices, NOTICES))
+@rows((looks, FACES), (columns, COLUMNS), (book, BOOK), (lacks, LACKING), (notices, NOTICES))
 def test_each(found: Callable[[], Any], expected: Any) -> None:
     assert found() == expected
 

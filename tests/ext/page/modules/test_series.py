@@ -87,6 +87,20 @@ const calls = [];
 store = Script({"core/store.js": "Store"}, _STORE)
 # fmt: off
 STORE: Rows = {
+    "components and new metrics are noticed": ("""
+        store.subscribe(null, null, () => calls.push(store.refs().join()));
+        store.subscribe("a", null, () => calls.push(store.metrics("a").join(" ")));
+        store.set("", "web/broker", {}); store.set("a", "m", 1); frame();
+        store.set("a", "m", 2); frame();
+        store.set("a", "n", 2); frame();
+        store.remove("a"); frame();
+        result = calls;""", ["a", "m", "m n", "", ""]),
+    "the period is the usual time between updates": ("""
+        const periods = [];
+        for (const wait of [0, 200, 210, 190, 5000, 200]) {
+          now += wait; store.set("a", "m", 1); periods.push(store.get("a", "m").period);
+        }
+        result = periods;""", [0, 0, 0, 200, 210, 200]),
     "a value ages from its age at the server": (
         'store.set("a", "m", 7, 400); now += 100; const v = store.get("a", "m"); result = [v.value, v.age];',
         [7, 500]),
@@ -151,6 +165,9 @@ timeline = Script(
 )
 # fmt: off
 PLAYED: Rows = {
+    "it may only seek, play and change the speed": ("""
+        opened(); feed.seek(1); feed.play(true); [0.25, 3, 8].forEach((speed) => feed.setSpeed(speed));
+        return it.sent.map((op) => op.speed ?? op.op);""", ["seek", "play", 0.25, 8]),
     "the first seek opens the socket there, and what follows goes on from it": ("""
         opened(); return [it.sockets[0].path, it.begun, feed.position, feed.seeking, feed.seeks];""",
         ["ws/replay?robot=a%2Fb%2Fc&at=5000", 1, 5000, False, 1]),
