@@ -32,7 +32,7 @@ from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
-from pebble.contract import CAPABILITIES, channel_of
+from pebble.contract import channel_of
 from pebble.extensions.fleet.audit import Audit
 from pebble.extensions.media.packets import Picture, PictureKind
 from pebble.extensions.operator.client.drive_reasons import WORDS
@@ -45,7 +45,6 @@ from pebble.extensions.page.shown import shown
 from pebble.extensions.page.static_files import StaticFiles
 from pebble.transports import MqttSettings
 from tests.ext.page.browser import Size, Tab, tab
-from tests.ext.recordings.playing import GOOB, Line, js, ms, write
 from tests.ext.recordings.seek.test_archive import film
 from tests.support import ROOT, WAIT_S, free_port, until
 
@@ -276,9 +275,7 @@ class CannedServer:
 def _recorded() -> TemporaryDirectory[str]:
     """Make recordings for all tests of this process, with which they are removed."""
     made = TemporaryDirectory(prefix="pebble-recorded-")
-    heard = js(t=ms(0), value={"video": {"available": True}, "audio": {"available": True}})
-    offers = Line(0.01, CAPABILITIES.topic(GOOB), heard, retain=True)
-    write(film(Path(made.name), "json", 60) / "offers.mcap", [offers])
+    film(Path(made.name), "json", 60)
     return made
 
 
