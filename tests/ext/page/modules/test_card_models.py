@@ -68,6 +68,14 @@ WHY_NO_FLASH = {
 }
 # fmt: off
 LIGHTS: Rows = {
+    "a refusal does not undo what was asked after it": (f"""{_ANSWER}
+        one.ask(page, {{ mode: "solid" }});
+        one.sentAt = -Infinity;
+        one.ask(page, {{ mode: "off" }});
+        answer(1, "refused");
+        result = [lit()[0]];
+        answer(2, "done");
+        result.push(lit()[0], followers.size);""", ["off", "off", 0]),
     **{f"what is asked of lights: {change}": (f"lightsOf(ref).ask(page, {change}); result = sent;", [expected])
         for change, expected in ASKED.items()},
     **{f"a flash ends in what was before: {before}": (f"""
@@ -110,6 +118,11 @@ GROUPS = [
 ]
 # fmt: off
 SOUNDS: Rows = {
+    "what cannot be played is not repeated": ("""
+        result = [play(page, ref, "x".repeat(1001), false), repeatLast(page, ref)];
+        values[ref].capabilities.value.soundboard.controls = false;
+        result.push(play(page, ref, "horn.wav", false), repeatLast(page, ref), sent);""",
+        ["Its name is too long", "Play one sound first", *["goob takes no such commands"] * 2, []]),
     "the last sound is repeated as it was played": ("""
         result = [repeatLast(page, ref), play(page, ref, "a/horn.wav", true), repeatLast(page, ref),
           repeatLast(page, "pebble/robots/fred"), sent];""",
@@ -146,8 +159,11 @@ HINTS = [
     (entry("a", "float", max=2, default=1.5), "A number, at most 2"),
     (entry("a"), ""),
 ]
+NOT_STORED = '[[1,2,3],["goob","a",{"x":1}],["goob","a",[["x",1]]],null]'
 # fmt: off
 FORMS: Rows = {
+    "a memory of something else is none": (f"""
+        stored.set("pebble forms", {json.dumps(NOT_STORED)}); result = texts(remembered("goob", "a"));""", {}),
     "what was filled in is sent in the types of JSON": (f"""
         result = [{{ tag: "7" }}, {json.dumps(GIVEN)}].map(
           (texts) => filled({json.dumps(ALL)}, new Map(Object.entries(texts))));""", [{"tag": 7}, SENT]),

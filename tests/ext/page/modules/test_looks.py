@@ -36,6 +36,9 @@ def stated(**identity: Any) -> str:
 # fmt: off
 WHOLE = {"name": "Otto", "description": "A boat", "colour": "rose", "picture": "boat"}
 FACES: Rows = {
+    "what is long is cut": (
+        f"const one = look('r7', {stated(name='x' * 40, description='y' * 99)}); result = [one.name, one.description];",
+        ["x" * 32 + " (r7)", "y" * 60]),
     "it looks as it says": (
         f"result = look('otto', {stated(**WHOLE, battery_cells=2)});", {**WHOLE, "cells": 2}),
     "a name that is not its id has it behind": (

@@ -51,6 +51,16 @@ TRAILS = {
 }
 # fmt: off
 RUN: Rows = {
+    "it is bounded in number and time": ("""
+        for (let at = 0; at < 20_000; at++) one.push(at, at);
+        const count = one.times.length;
+        for (let at = 1; at < 400; at++) one.push(20_000 + at * 1000, at);
+        result = [count, one.times.length <= 183, one.times.at(-1) - one.times[0] < 183_000];""",
+        [pytest.approx(1000, abs=63), True, True]),
+    "a component at rest leaves few poses": ("""
+        const path = new core.Series(trail.poseOf, { spanMs: 3_600_000, most: 4000, differs: trail.differs });
+        for (let at = 0; at < 100_000; at += 50) path.push(at, { value: { x_mm: 1, y_mm: 0 } });
+        result = [path.times.length, trail.pieces(path.times, path.rows).length];""", [100, 1]),
     "a value that is sent again is no new one": (
         "one.push(1000, 1); one.push(990, 1); one.push(2700, 1); result = shown(one);", [[1000, 1], [2700, 1]]),
     "what is cleared does not come back": ("""
