@@ -223,6 +223,16 @@ def test_whatever_a_robot_publishes_pages_get_json(metric: str) -> None:
         json.loads(bytes(robots.value(GOOB, metric) or b"null"), parse_constant=pytest.fail, parse_int=str)
 
 
+def test_a_value_ends_with_an_empty_message() -> None:
+    robots, interest = Robots(), Interest(lambda: None)
+    robots.join(interest)
+    robots.watch(interest, GOOB)
+    robots.receive(published(GOOB, DESCRIBE, {}), 1.0)
+    assert [value[:2] for value in robots.take(interest, 2.0, large=False)[0]] == [(GOOB, DESCRIBE)]
+    robots.receive(published(GOOB, DESCRIBE, b""), 1.0)
+    assert robots.take(interest, 3.0, large=False) == (((GOOB, DESCRIBE, None, 0.0),), False)
+
+
 # -- log lines
 
 
