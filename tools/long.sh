@@ -13,7 +13,7 @@ make long PART=stops      400 random schedules of people, stops, scripts and fau
 make long PART=soak       floods, kills, freezes, full disks and more while an operator drives, ten minutes
 make long PART=schedules  random schedules in virtual time, an hour
 make long PART=page       every state, card, interruption and finger at the operator page in Chromium, 25 minutes
-make long PART=engines    drive and stop a robot at the page in Firefox and WebKitGTK, and a demo in Firefox, ten minutes
+make long PART=engines    drive and stop a robot at the page in Firefox and WebKitGTK, five minutes
 make long PART=looks      store anew how the page looks, for PART=page to compare; look at the pictures, a minute
 make long PART=fleet      brokers and hubs that are killed, hung and cut off under driven robots and 300 boards, 16 minutes
 make long PART=brokers    install NATS, RabbitMQ and aedes where possible, test robots with them, judge them, seven minutes
@@ -44,9 +44,9 @@ schedules) # the shortest schedule that violates a rule is printed, or the seed 
     $python -m tests.kit.schedules motion --schedules 10000
     $python -m tests.kit.schedules services --schedules 20000 --jobs 2
     ;;
-page) $python -m pytest --workers 8 -m page --ignore tests/ext/page/engines tests/ext/page ;;
-engines) $python -m pytest -ra -m page tests/ext/page/engines ;;
-looks) $python -m tests.ext.page.looks ;;
+page) $python -m pytest --workers 8 -m page --ignore tests/ext/page/test_engines.py tests/ext/page ;;
+engines) $python -m pytest -ra -m page tests/ext/page/test_engines.py ;;
+looks) PEBBLE_LOOKS=store $python -m pytest -m page -k looks_as_it_is_stored tests/ext/page/page/test_look.py ;;
 fleet) tests --workers 2 --timeout 900 -s tests/ext/fleet ;;
 brokers)
     sh tests/ext/checks/brokers/install.sh

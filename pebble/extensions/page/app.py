@@ -17,10 +17,9 @@ from urllib.parse import parse_qsl, quote
 import msgspec
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
-from starlette.requests import Request
+from starlette.requests import HTTPConnection, Request
 from starlette.responses import HTMLResponse, PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
-from starlette.types import Lifespan
 from starlette.websockets import WebSocket
 
 from pebble.extensions.fleet import certificates
@@ -61,11 +60,7 @@ def create_app(settings: WebSettings) -> Starlette:
         audit = Audit(settings.people)
         archive = None if settings.recordings is None else Recordings(settings.recordings)
         server = Server(settings, people, audit)
-        state = app.state
-        state.server, state.audit, state.stops = server, audit, server.stops
-        state.recordings = archive
-        state.robots, state.broker = server.robots, server.broker
-        state.media, state.sound = server.pictures, server.sound
+        app.state.server, app.state.audit, app.state.recordings = server, audit, archive
         await server.open()
         try:
             yield
@@ -75,14 +70,7 @@ def create_app(settings: WebSettings) -> Starlette:
             if archive is not None:
                 await archive.close()
 
-    app = _app(settings, lifespan)
-    app.state.settings, app.state.people = settings, people
-    app.state.static, app.state.version = static, static.version
-    return app
-
-
-def _app(settings: WebSettings, lifespan: Lifespan[Starlette]) -> Starlette:
-    return Starlette(
+    app = Starlette(
         routes=[
             Route("/", _page),
             Route("/r/{ref:path}", _page),
@@ -104,6 +92,9 @@ def _app(settings: WebSettings, lifespan: Lifespan[Starlette]) -> Starlette:
         lifespan=lifespan,
         middleware=[Middleware(Guard, settings=settings)],
     )
+    app.state.settings, app.state.people = settings, people
+    app.state.static, app.state.version = static, static.version
+    return app
 
 
 async def _page(request: Request) -> Response:
@@ -137,17 +128,17 @@ async def _authority(request: Request) -> Response:
 
 async def _health(request: Request) -> Response:
     """Answer 200 while the broker is connected, and nothing more: this needs no login."""
-    connected = request.app.state.broker.connected
+    connected = _server_of(request).broker.connected
     return PlainTextResponse("ok" if connected else "no broker", 200 if connected else 503, headers=NO_STORE)
 
 
 async def _snapshot(request: Request) -> Response:
     if login.session_of(request) is None:
         return PlainTextResponse("log in first", 401)
-    ref, state = request.query_params.get("ref", ""), request.app.state
-    if ref not in state.robots.components:
+    ref, server = request.query_params.get("ref", ""), _server_of(request)
+    if ref not in server.robots.components:
         return PlainTextResponse("no such component", 404)
-    still = await state.media.snapshot(ref)
+    still = await server.pictures.snapshot(ref)
     if still is None:
         return Response(status_code=204, headers=NO_STORE)
     jpeg, received_at = still
@@ -224,8 +215,8 @@ async def _audit(request: Request) -> Response:
     return Response(msgspec.json.encode(rows), media_type="application/json", headers=NO_STORE)
 
 
-def _server_of(request: Request) -> Server:
-    server: Server = request.app.state.server
+def _server_of(connection: HTTPConnection) -> Server:
+    server: Server = connection.app.state.server
     return server
 
 
@@ -235,16 +226,16 @@ async def _control(websocket: WebSocket) -> None:
         await websocket.close(4401)
         return
     await websocket.accept()
-    await Control(websocket.app.state.server, websocket, session, lambda: login.session_of(websocket)).serve()
+    await Control(_server_of(websocket), websocket, session, lambda: login.session_of(websocket)).serve()
 
 
 async def _media(websocket: WebSocket) -> None:
-    media = websocket.app.state.media
+    media = _server_of(websocket).pictures
     await _serve(websocket, lambda ref, decodes, _: media.serve(websocket, ref, decodes & _ENCODINGS))
 
 
 async def _sound(websocket: WebSocket) -> None:
-    sound = websocket.app.state.sound
+    sound = _server_of(websocket).sound
     device, address = login.printable(websocket.query_params.get("device", "")), login.address_of(websocket)
     await _serve(websocket, lambda ref, plays, session: sound.serve(websocket, ref, plays, session, device, address))
 
@@ -273,7 +264,7 @@ async def _serve(
     ``serve`` gets the component, the encodings that the page can decode, and the session.
     """
     ref, session = websocket.query_params.get("ref", ""), login.session_of(websocket)
-    if session is None or ref not in websocket.app.state.robots.components:
+    if session is None or ref not in _server_of(websocket).robots.components:
         await websocket.close(4401)
         return
     await websocket.accept()
@@ -286,7 +277,7 @@ async def _while_allowed(websocket: WebSocket, session: Session, work: Coroutine
 
     The session is checked soon after people or sessions have changed, and every few seconds in any case.
     """
-    server: Server = websocket.app.state.server
+    server = _server_of(websocket)
     checked_version, check_at = server.people_version, time.monotonic() + CHECK_S
     serving = asyncio.ensure_future(work)
     try:

@@ -200,7 +200,7 @@ class Control:
                 self._control(op)
             case m.PictureFromOp():
                 if self._may("drive", op):
-                    self._server.sources.choose(op.ref, op.source)
+                    self._server.choose_picture(op.ref, op.source)
             case m.BoardOp():
                 self._board(op)
             case m.Hello():

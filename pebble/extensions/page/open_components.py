@@ -12,7 +12,6 @@ from msgspec.structs import replace
 
 from pebble import contract as c
 from pebble.contract import OUTGOING, codec
-from pebble.contract.payloads import AnyObject
 from pebble.errors import PayloadError, PebbleError
 from pebble.extensions.operator.client.broker import Broker
 from pebble.extensions.operator.client.robot_topics import FLAGS, PLACES, WATCHED
@@ -29,7 +28,7 @@ STEP_S = 1.0  # between two changes of what is received of one component: capabi
 
 
 class _Meaning(NamedTuple):
-    """The component and channel of a topic whose name does not show them: flags, aliases, and renamed topics."""
+    """The component and channel of a topic whose name does not show them: flags and renamed topics."""
 
     ref: str
     channel: c.Channel
@@ -56,13 +55,9 @@ class OpenComponents:
         broker: Broker,
         robots: Robots,
         spawn: Callable[[Coroutine[Any, Any, None]], None],
-        *,
-        keep_s: float = KEEP_S,
-        step_s: float = STEP_S,
     ) -> None:
-        """Store the arguments. ``spawn`` runs a coroutine in the background; for the times see KEEP_S and STEP_S."""
+        """Store the arguments. ``spawn`` runs a coroutine in the background."""
         self._broker, self._robots, self._spawn = broker, robots, spawn
-        self._keep_s, self._step_s = keep_s, step_s
         self._pages: Counter[str] = Counter()  # by component: how many have it open
         self._subscriptions: dict[str, dict[str, Subscription]] = {}  # by component and filter
         self._following: set[str] = set()  # components whose task, _follow, runs
@@ -83,7 +78,7 @@ class OpenComponents:
         self.update(ref)
 
     def close(self, ref: str) -> None:
-        self._broker.loop.call_later(self._keep_s, self._closed, ref)
+        self._broker.loop.call_later(KEEP_S, self._closed, ref)
 
     def _closed(self, ref: str) -> None:
         """Note that a page was closed. It is called after a delay, so that a reloaded page still finds everything."""
@@ -123,7 +118,7 @@ class OpenComponents:
                         continue
                     self._forget(ref)
                     return
-                await asyncio.sleep(self._step_s)  # the least time between two changes
+                await asyncio.sleep(STEP_S)  # the least time between two changes
                 if ref in self._pages and self._filters(ref).keys() == subscriptions.keys():
                     return  # nothing has changed meanwhile, and nothing failed
         finally:
@@ -144,15 +139,12 @@ class OpenComponents:
 
         def take(message: Message, now: float) -> None:
             meaning = self._wanted.get(ref, {}).get(filter_)  # None: the topic's name shows component and channel
-            aliases_before = self._robots.aliases(ref)
             if meaning is None:
                 self._robots.receive(message, now)
             elif meaning.channel.kind is c.Kind.FLAG:
                 self._receive_flag(ref, meaning.channel, message)
             else:
                 self._robots.receive_as(meaning.ref, meaning.channel.metric, message, now, meaning.channel)
-            if self._robots.aliases(ref) != aliases_before:  # it was a manifest, with other topics to subscribe to
-                self.update(ref)
 
         return take
 
@@ -177,9 +169,6 @@ class OpenComponents:
         filters: _Filters = {channel.filter(ref): None for channel in WATCHED}  # None: the names tell the meaning
         for channel in _NAMED:
             self._add(filters, ref, channel)
-        for metric in self._robots.aliases(ref):
-            alias = c.Channel(metric=metric, kind=c.Kind.STREAM, payload=AnyObject)
-            filters.setdefault(f"{ref}/{OUTGOING}/{metric}", _Meaning(ref, alias))
         for flag in FLAGS.values():
             filters[self._robots.topic(ref, flag)] = _Meaning(ref, flag)
         source = self._robots.sources.get(ref, ref)

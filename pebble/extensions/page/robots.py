@@ -5,17 +5,15 @@ There is no queue: a slow page gets newest values less often. A page that connec
 """
 
 import logging
-import re
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
-from itertools import chain
 from typing import Any, NamedTuple
 
 import msgspec
 
 from pebble import contract as c
-from pebble.contract import OUTGOING, channel_of, codec, is_reserved
-from pebble.contract.identity import LEVEL, parse_topic
+from pebble.contract import OUTGOING, channel_of, codec
+from pebble.contract.identity import parse_topic
 from pebble.errors import PayloadError
 from pebble.extensions.operator.client.robot_topics import FLEET, topic_of
 from pebble.extensions.operator.client.robot_view import RobotView
@@ -31,12 +29,8 @@ _MAX_CLIPS_BYTES = 400 * 1024  # of the list of clips, which has up to 256 KiB o
 LARGE_BYTES = 16 * 1024  # a value beyond holds up a slow connection: one is sent, then the page has to answer
 MAX_STATE_BYTES = 128 * 1024  # of values in one message: pings, by which pages drive, do not wait for thousands
 MAX_BYTES = 64 * 1024 * 1024  # of all values together, but for those of components that are open, driven or stopped
-MAX_ALIASES = 64  # of one component: topics that its microcontrollers declare besides the contract's
 _REFRESH_S = 1.0  # a component's values that change with every heartbeat are sent this often at most,
 _REFRESHES_PER_S = 100  # and those of so many components a second, besides the open ones
-_LONGEST_ALIAS = 200  # characters
-
-_valid_level = re.compile(LEVEL).search
 
 
 class _Value(NamedTuple):
@@ -51,7 +45,6 @@ class Component:
         self.ref = ref
         self.robot = RobotView(ref)
         self.values: dict[str, _Value] = {}
-        self.aliases: dict[str, tuple[str, ...]] = {}  # by metric of the manifest that declares them
         self.sent_online: bool | None = None
         self.refreshed_at = float("-inf")
 
@@ -122,12 +115,6 @@ class Robots:
     def topic(self, ref: str, channel: c.Channel) -> str:
         """Return the topic that the component's capabilities name for ``channel``, else the channel's own."""
         return topic_of(ref, self.capabilities(ref), channel)
-
-    def aliases(self, ref: str) -> list[str]:
-        """Return the metrics beyond the contract under which the component's MCUs publish, by their manifests."""
-        component = self.components.get(ref)
-        declared = () if component is None else component.aliases.values()
-        return list(dict.fromkeys(chain.from_iterable(declared)))[:MAX_ALIASES]
 
     def value(self, ref: str, metric: str) -> msgspec.Raw | None:
         """Return the newest value, also of a metric of the server; None if there is none."""
@@ -232,7 +219,7 @@ class Robots:
             message = msgspec.structs.replace(message, payload=trimmed)
         if message.payload and not self._store(component, metric, channel, message, now):
             return
-        self._interpret(component, metric, channel, message, now)
+        self._interpret(component, channel, message, now)
 
     def forget(self, ref: str) -> None:
         """Remove a component, if it is there. It comes back with its next message."""
@@ -332,15 +319,12 @@ class Robots:
         if old is not None:
             self._bytes -= len(bytes(old.raw))
             self._mark(component.ref, metric)
-        component.aliases.pop(metric, None)
 
-    def _interpret(self, component: Component, metric: str, channel: c.Channel, message: Message, now: float) -> None:
+    def _interpret(self, component: Component, channel: c.Channel, message: Message, now: float) -> None:
         """Update the view of the robot from a message that arrived at ``now``."""
         robot, capabilities_before = component.robot, component.robot.capabilities
         wall = time.time() - (time.monotonic() - now)  # the epoch time at ``now``, which is monotonic
         robot.receive(channel, message, now, wall)
-        if channel is c.MCU_DESCRIBE and message.payload:
-            component.aliases[metric] = _aliases(message.payload)
         if robot.capabilities is not capabilities_before and "announced" in robot.capabilities:
             self.show_announced(component, now)
         if robot.liveness.reported_offline and component.sent_online is not False:
@@ -386,28 +370,3 @@ class Robots:
 
 def _channel(metric: str) -> c.Channel | None:
     return channel_of(f"{OUTGOING}/{metric}")
-
-
-def _aliases(payload: bytes) -> tuple[str, ...]:
-    """Return an MCU's aliases, the metrics of its values besides ``mcu/…``; the rest of its manifest may be invalid."""
-    manifest = codec.plain(c.MCU_DESCRIBE, payload)
-    interfaces = manifest.get("interfaces") if isinstance(manifest, dict) else None
-    metrics: list[str] = []
-    for interface in interfaces if isinstance(interfaces, list) else ():
-        if isinstance(interface, dict) and interface.get("dir") == "out":
-            metric = interface.get("channel")
-            if isinstance(metric, str):
-                metrics.append(metric)
-    return tuple(filter(_may_be_alias, metrics[:MAX_ALIASES]))
-
-
-def _may_be_alias(metric: str) -> bool:
-    """True if this metric may be an alias (see `_aliases`): neither the contract nor the server itself defines it."""
-    family = metric.partition("/")[0]
-    return (
-        _channel(metric) is None
-        and not is_reserved(metric)
-        and family not in ("web", "mcu")  # of the server itself, and the generic topics of MCUs
-        and len(metric) <= _LONGEST_ALIAS
-        and all(map(_valid_level, metric.split("/")))
-    )

@@ -26,7 +26,6 @@ from pebble.extensions.operator.client.heartbeats import Heartbeats
 from pebble.extensions.operator.client.robot_topics import FLEET, SYNONYMS
 from pebble.extensions.page import messages as m
 from pebble.extensions.page.drive.drivers import Drivers
-from pebble.extensions.page.media.chosen_sources import ChosenSources
 from pebble.extensions.page.media.pictures import MediaHub
 from pebble.extensions.page.media.sound import SoundHub
 from pebble.extensions.page.open_components import OpenComponents
@@ -45,6 +44,7 @@ PEOPLE_S = 0.5  # between two looks at whether people or sessions were changed
 _REFRESH_S = 0.25
 _MANY_WAIT = 16 * 1024  # bytes that the broker has not confirmed
 _ESTOP_METRIC = "web/estop"
+_PICTURE = "picture-from "  # begins the key of a setting in the people's database; the component follows
 
 
 class Server:
@@ -65,8 +65,6 @@ class Server:
             broker.is_named = self._is_named
         self._heartbeats: Heartbeats | None = None  # while a stop of all goes to further robots
         self.open_components = OpenComponents(self.broker, self.robots, self.spawn)
-        # With another picture, a page gets the overlays of that robot.
-        self.sources = ChosenSources(people, self.robots, self.open_components.update)
         self.boards = SilentBoards(self.broker, self.robots, self.drivers, people, settings)
         self.drivers.refusals.is_stopping = self.stops.holds
         # The table of robots is bounded, and does not know what is open, driven or stopped.
@@ -220,11 +218,30 @@ class Server:
         """Note that a page has opened this component."""
         if _is_base(ref):
             self.open_components.open(ref)
-            self.sources.show(ref)
+            self._show_source(ref)
 
     def unwatch(self, ref: str) -> None:
         if _is_base(ref):
             self.open_components.close(ref)
+
+    def choose_picture(self, ref: str, source: str) -> None:
+        """Show the picture of ``source`` on the page of ``ref``, for everybody, and store that; "" is its own."""
+        if ref in self.robots.components and (not source or source in self.robots.components):
+            self.people.set(_PICTURE + ref, "" if source == ref else source)
+            self._show_source(ref)
+
+    def _show_source(self, ref: str) -> None:
+        """Send pages the chosen source of this component's picture, and the drawings over it."""
+        try:
+            source = self.people.get(_PICTURE + ref)
+        except DatabaseError as error:
+            log.warning("where the picture of %s comes from is not known: %s", ref, error)
+            return
+        self.robots.sources.pop(ref, None)
+        if source:
+            self.robots.sources[ref] = source
+        self.open_components.update(ref)
+        self.robots.set_server_metric(ref, "web/picture-from", m.PictureFrom(source=source))
 
     # -- what is due
 

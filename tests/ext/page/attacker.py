@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -101,6 +102,12 @@ class Everything:
     def incoming(self, base: str = "") -> set[str]:
         """Return the topics of commands, to this component or to any."""
         return {one.topic for one in list(self.messages) if "/incoming/" in one.topic and one.topic.startswith(base)}
+
+    def latched(self, name: str) -> bool:
+        """True if all motor owners of this robot say that they are stopped."""
+        prefix = f"pebble/robots/{name}/outgoing/estop/"
+        states = {one.topic: one.payload for one in list(self.messages) if one.topic.startswith(prefix)}
+        return bool(states) and all(json.loads(state)["latched"] for state in states.values())
 
     def close(self) -> None:
         self._transport.close()

@@ -9,7 +9,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -64,19 +64,14 @@ _FLAGS = (
 
 
 @contextmanager
-def chromium(*flags: str, beside: Browser | None = None) -> Iterator[Browser]:
-    """Run a headless browser with further ``flags``.
-
-    It may run ``beside`` another one: a thread has one Playwright. Skips the test without a Chromium, except where CI
-    says it must be there.
-    """
+def chromium() -> Iterator[Browser]:
+    """Run a headless browser. Skips the test without a Chromium, except where CI says it must be there."""
     program = shutil.which("chromium")
     if program is None:
         reason = "no Chromium: apt install chromium, or `sh tools/debian-packages.sh chromium=chromium`"
         (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(reason)
-    with ExitStack() as stack:
-        kind = stack.enter_context(sync_playwright()).chromium if beside is None else beside.browser_type
-        yield stack.enter_context(closing(kind.launch(executable_path=program, args=[*_FLAGS, *flags])))
+    with sync_playwright() as all_, closing(all_.chromium.launch(executable_path=program, args=_FLAGS)) as browser:
+        yield browser
 
 
 @dataclass
@@ -177,11 +172,6 @@ def tab(
         yield opened
     finally:
         context.close()
-
-
-def answer(source: str) -> Callable[[Route], object]:
-    """A route that has this module instead of the server's."""
-    return lambda route: route.fulfill(body=source, content_type="text/javascript")
 
 
 def _prepared(context: BrowserContext, script: str) -> Tab:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import io
-import itertools
 import json
 import struct
 import sys
@@ -17,7 +16,10 @@ import zlib
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AbstractContextManager, asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import cache
 from importlib.resources import files
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import msgspec
@@ -32,8 +34,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from pebble.contract import channel_of
 from pebble.extensions.fleet.audit import Audit
-from pebble.extensions.media.packets import Codec, Picture, PictureKind, Sound
-from pebble.extensions.media.speech import Speech
+from pebble.extensions.media.packets import Picture, PictureKind
 from pebble.extensions.operator.client.drive_reasons import WORDS
 from pebble.extensions.page.access.guard import CONTENT_SECURITY_POLICY
 from pebble.extensions.page.log_lines import line_of
@@ -44,6 +45,7 @@ from pebble.extensions.page.shown import shown
 from pebble.extensions.page.static_files import StaticFiles
 from pebble.transports import MqttSettings
 from tests.ext.page.browser import Size, Tab, tab
+from tests.ext.recordings.seek.test_archive import film
 from tests.support import ROOT, WAIT_S, free_port, until
 
 PING_S = 0.5
@@ -74,9 +76,7 @@ class State:
     still: bool = False  # cameras show flat colours, and a few pictures only
     at: int = 0  # ms epoch, at which the server's time stands still; 0: it does not
     logs: Callable[[int], list[Any]] = field(default=lambda _now: [])  # lines of the component that is open
-    recordings: bool = False  # those of tests.ext.page.recorded are offered
-    days: tuple[int, str] | None = None  # status and text that a list of recorded days is answered with
-    audit: list[Any] = field(default_factory=list)  # of a robot, as it is read
+    recordings: bool = False  # of goob a minute is recorded
 
 
 class CannedServer:
@@ -95,15 +95,13 @@ class CannedServer:
                 Route("/r/{ref:path}", self._page),
                 Route("/replay", self._page),
                 Route("/replay/{ref:path}", self._page),
-                *(self._archive(route) for route in recordings.routes()),
+                *recordings.routes(),
                 Route("/static/{version}/{name:path}", self._static),
                 Route("/stream", self._stream),
                 Route("/api/snapshot.jpg", self._snapshot),
-                Route("/api/audit", self._audit),
                 Route("/api/{name}", self._post, methods=["POST"]),
                 WebSocketRoute("/ws/control", self._control),
                 WebSocketRoute("/ws/media", self._media),
-                WebSocketRoute("/ws/sound", self._sound),
                 WebSocketRoute("/ws/replay", self._replay),
             ],
             lifespan=self._life,
@@ -111,7 +109,6 @@ class CannedServer:
         app.state.settings = WebSettings(broker=MqttSettings(host="127.0.0.1"))
         app.state.audit = Audit(None)
         app.state.recordings = None
-        app.state.recognise = lambda _client, _user: None
         self._app = app
         config = uvicorn.Config(app, "127.0.0.1", self.port, log_level="critical", ws_per_message_deflate=False)
         self._server = uvicorn.Server(config)
@@ -133,9 +130,7 @@ class CannedServer:
         """What pages that connect from now on are shown."""
         self.state = state
         if state.recordings and self._app.state.recordings is None:
-            from tests.ext.page.recorded import folder  # which needs the states, and these this module
-
-            self._app.state.recordings = recordings.Recordings(folder())
+            self._app.state.recordings = recordings.Recordings(Path(_recorded().name))
         self.received.clear()
         self.posted.clear()
 
@@ -157,19 +152,6 @@ class CannedServer:
 
     # -- http
 
-    def _archive(self, route: Route) -> Route:
-        """The real route, or the answer that the state has for it."""
-        if route.path != "/archive/days":
-            return route
-
-        async def days(request: Request) -> Response:
-            if self.state.days is None:
-                return await route.endpoint(request)
-            status, text = self.state.days
-            return Response(text, status)
-
-        return Route(route.path, days)
-
     async def _page(self, request: Request) -> Response:
         return self.static.page(request)
 
@@ -187,9 +169,6 @@ class CannedServer:
         age = "0" if request.query_params["ref"].endswith("goob") else "40"
         still = flat() if self.state.still else picture(0)
         return Response(still, media_type="image/jpeg", headers=_headers() | {"age": age})
-
-    async def _audit(self, _request: Request) -> Response:
-        return JSONResponse(self.state.audit)
 
     async def _post(self, request: Request) -> Response:
         self.posted.append((request.path_params["name"], json.loads(await request.body() or "{}")))  # a form has none
@@ -291,15 +270,13 @@ class CannedServer:
                 await websocket.receive_bytes()  # drawn
                 await asyncio.sleep(PICTURE_S)
 
-    async def _sound(self, websocket: WebSocket) -> None:
-        await websocket.accept()
-        reading = asyncio.ensure_future(_until_closed(websocket))
-        with suppress(WebSocketDisconnect, RuntimeError):
-            for number in itertools.count(1):
-                piece = Speech(16_000).samples(320 * number, 320).tobytes()
-                await websocket.send_bytes(Sound(Codec.PCM16LE, 1, 16_000, 320, number, self.now(), piece).pack())
-                await asyncio.sleep(0.02)
-        reading.cancel()
+
+@cache
+def _recorded() -> TemporaryDirectory[str]:
+    """Make recordings for all tests of this process, with which they are removed."""
+    made = TemporaryDirectory(prefix="pebble-recorded-")
+    film(Path(made.name), "json", 60)
+    return made
 
 
 def _headers() -> dict[str, str]:

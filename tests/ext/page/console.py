@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -11,7 +10,6 @@ from typing import Any
 
 from playwright.sync_api import Browser, Error, Locator
 
-from pebble.transports import Message, MqttSettings, create
 from tests.ext.page.browser import Size, Tab, Theme, tab
 from tests.ext.page.stage import Stage
 from tests.support import SOON_S, WAIT_S
@@ -19,17 +17,6 @@ from tests.support import SOON_S, WAIT_S
 Wheels = tuple[int, int]
 
 FORWARD, BACK, LEFT, RIGHT, REST = (1, 1), (-1, -1), (-1, 1), (1, -1), (0, 0)
-#: Key, and what the wheels do: their signs, left and right.
-KEYS: dict[str, Wheels] = {
-    "KeyW": FORWARD,
-    "KeyS": BACK,
-    "KeyA": LEFT,
-    "KeyD": RIGHT,
-    "ArrowUp": FORWARD,
-    "ArrowDown": BACK,
-    "ArrowLeft": LEFT,
-    "ArrowRight": RIGHT,
-}
 QUIET_S = 0.4  # so long nothing may turn where nothing may turn: eight commands of a gesture
 _PRESSES = 6
 _MOVES_S = 3.0
@@ -62,9 +49,6 @@ class Console:
         box = self.test(name).bounding_box()
         assert box is not None
         return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2, box["width"]
-
-    def uncover(self, name: str) -> Locator:
-        return self.tab.uncover(name)
 
     @property
     def reason(self) -> str:
@@ -210,28 +194,6 @@ def used(opened: Console, *, complaints: bool = True) -> Iterator[Console]:
     assert opened.rests(), opened.speeds
     found = opened.tab.complaints()[before:]
     assert [one for one in found if complaints or not _of_connection(one)] == []
-
-
-class Wire:
-    """What motor owners publish of stops at the operators' broker."""
-
-    def __init__(self, stage: Stage) -> None:
-        self._last: dict[str, Any] = {}
-        self._transport = create("mqtt", "wire", MqttSettings(host="127.0.0.1", port=stage.broker_port))
-        self._transport.open()
-        self._transport.subscribe("pebble/+/+/outgoing/estop/+", self._receive)
-
-    def latched(self, name: str) -> bool:
-        """Whether all motor owners of a robot say that they are stopped."""
-        prefix = f"pebble/robots/{name}/outgoing/estop/"
-        states = [payload for topic, payload in list(self._last.items()) if topic.startswith(prefix)]
-        return bool(states) and all(state["latched"] for state in states)
-
-    def close(self) -> None:
-        self._transport.close()
-
-    def _receive(self, message: Message) -> None:
-        self._last[message.topic] = json.loads(message.payload)
 
 
 def _of_connection(complaint: str) -> bool:

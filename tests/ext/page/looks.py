@@ -8,7 +8,7 @@ all of them together are small.
 from __future__ import annotations
 
 import io
-import sys
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -17,14 +17,13 @@ import numpy.typing as npt
 from PIL import Image
 from playwright.sync_api import Browser, Page
 
-from tests.ext.page.browser import Tab, Theme, chromium
-from tests.ext.page.canned import CannedServer, State, serving, showing
-from tests.ext.page.states import DRIVING, STATES
+from tests.ext.page.browser import Tab, Theme
+from tests.ext.page.canned import CannedServer, State, showing
+from tests.ext.page.states import STATES
 from tests.support import ROOT
 
 STORED = ROOT / "tests/ext/page/page/looks"
 FAILED = ROOT / "build" / "looks"
-MOST_BYTES = 600_000  # of all stored pictures
 LEVELS, SHARE = 12, 0.0003  # a pixel differs by more than so many of 255 levels; this share of them may
 AT = 1_795_341_630_000  # 22 November 2026, 10:00:30 UTC
 SIZES = {"desktop": (1440, 900), "tall": (1440, 1960), "phone": (390, 844), "landscape": (844, 390)}
@@ -38,14 +37,6 @@ FROZEN = f"""{{
   }};
   performance.now = () => 5000;
 }}"""
-#: The server never answers.
-UNANSWERED = """window.WebSocket = class extends EventTarget {
-  readyState = 0;
-  send() {}
-  close() {}
-};"""
-#: What is fetched without a server, too.
-_PARTS = "!document.querySelector('.loading') && Boolean(document.querySelector('.key-place'))"
 _HERE = """!document.querySelector('.loading, .bench:not([data-rests])') && document.fonts.status === 'loaded' &&
   [...document.images].every((one) => one.complete || one.hidden) &&
   (!pebble.video.ref || Boolean(pebble.video.info))"""
@@ -82,7 +73,6 @@ class Look:
     theme: Theme = "light"
     act: Act = nothing
     here: str = _HERE
-    script: str = ""
 
 
 LOOKS: dict[str, Look] = {
@@ -91,11 +81,6 @@ LOOKS: dict[str, Look] = {
     "fleet-stops": Look(STATES["fleet-stopped"], size="phone", act=press("[data-test=stopped]")),
     "fleet-phone": Look(STATES["fleet"], size="phone", theme="dark"),
     "fleet-empty": Look(STATES["fleet-empty"]),
-    "connecting": Look(
-        DRIVING,
-        here=_PARTS,
-        script=UNANSWERED,
-    ),
     "robot": Look(STATES["full"], size="tall"),
     "free": Look(STATES["free"], theme="dark"),
     "hint": Look(STATES["free"], act=lambda page: page.locator("[data-test=stick]").click(force=True)),
@@ -126,7 +111,7 @@ def taken(server: CannedServer, browser: Browser, look: Look) -> Pixels:
         "desktop" if width == SIZES["desktop"][0] else "phone",
         viewport={"width": width, "height": height},
         theme=look.theme,
-        script=FROZEN + look.script,
+        script=FROZEN,
         **options,
     ) as opened:
         assert opened.until(look.here, 60), f"{state.path} is not shown"
@@ -149,10 +134,6 @@ def _at_rest(opened: Tab) -> Pixels:
     return seen[-1]
 
 
-def stored(name: str) -> Pixels:
-    return np.asarray(Image.open(STORED / f"{name}.webp").convert("RGB"))
-
-
 def difference(one: Pixels, other: Pixels) -> float:
     """Return the share of the pixels that differ."""
     if one.shape != other.shape:
@@ -161,8 +142,11 @@ def difference(one: Pixels, other: Pixels) -> float:
 
 
 def check(name: str, found: Pixels) -> None:
-    """An AssertionError names the picture that is not as it is stored."""
-    share = difference(found, stored(name))
+    """An AssertionError names the picture that is not as it is stored; with PEBBLE_LOOKS=store it is stored anew."""
+    target = STORED / f"{name}.webp"
+    if os.environ.get("PEBBLE_LOOKS") == "store":
+        Image.fromarray(found).save(target, lossless=True, quality=100, method=6)
+    share = difference(found, np.asarray(Image.open(target).convert("RGB")))
     if share <= SHARE:
         return
     FAILED.mkdir(parents=True, exist_ok=True)
@@ -171,26 +155,3 @@ def check(name: str, found: Pixels) -> None:
         f"{name} looks different in {share:.2%} of its pixels: see {actual.relative_to(ROOT)}. If it is meant to, "
         f"`make long PART=looks` renews {STORED.relative_to(ROOT)}"
     )
-
-
-def _store(name: str, picture: Pixels) -> int:
-    target = STORED / f"{name}.webp"
-    Image.fromarray(picture).save(target, lossless=True, quality=100, method=6)
-    return target.stat().st_size
-
-
-def main(names: list[str]) -> None:
-    STORED.mkdir(exist_ok=True)
-    with serving() as server, chromium() as browser:
-        for name in names or LOOKS:
-            size = _store(name, taken(server, browser, LOOKS[name]))
-            sys.stdout.write(f"{STORED.relative_to(ROOT)}/{name}.webp: {size} bytes\n")
-            sys.stdout.flush()
-    total = sum(path.stat().st_size for path in STORED.iterdir())
-    sys.stdout.write(f"{total} bytes in all; look at them before you commit them\n")
-    if total > MOST_BYTES:
-        sys.exit(f"more than {MOST_BYTES} bytes")
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])

@@ -12,7 +12,6 @@ from urllib.parse import urlsplit
 
 from pebble.contract.identity import Identity
 from pebble.extensions.lab.rig.testbed import ROBOTS, Testbed
-from pebble.extensions.lab.simulation.trace import Entry
 
 
 class Stage(Testbed):
@@ -56,18 +55,10 @@ class Stage(Testbed):
     def wheels_turning(self, name: str, since_ns: int | None = None) -> bool:
         """Whether its motors run now; with ``since_ns`` whether they have run at any time since then."""
         since_ns = time.monotonic_ns() if since_ns is None else since_ns
-        return self.last_motion_ns(name) > since_ns
-
-    def last_motion_ns(self, name: str) -> int:
-        """When its motors were last switched off; now if they run, 0 if they have never run."""
-        return max((end for _, end in self.motions(name)), default=0)
+        return max((end for _, end in self.motions(name)), default=0) > since_ns
 
     def restart_broker(self) -> None:
         """Start the operators' broker again at the same port, without its retained messages. Raises PebbleError."""
         self.end(self.remote_broker)
         self.remote_broker = self.broker("remote-broker", port=self.broker_port)
         self.remote_broker.wait()
-
-    def lines(self, name: str) -> list[Entry]:
-        """What its MCU received, oldest first."""
-        return [entry for entry in self.robots[name].entries() if entry.event == "line"]

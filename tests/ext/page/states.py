@@ -12,14 +12,11 @@ import msgspec
 from pebble.services.serial_mcu_bridge.pebble_serial_v1.manifest import parse_describe
 from tests.ext.boards import mcu_wire as wire
 from tests.ext.page.canned import State, Value
+from tests.ext.recordings.playing import ms
 
 GOOB, FRED, LAMP, BENJR = (f"pebble/robots/{name}" for name in ("goob", "fred", "minilamp", "benjr"))
 TOWER, EVE = "pebble/towers/tower-1", "pebble/people/eve"
 GOOB_PATH = f"/r/{GOOB}"
-#: When recordings of goob begin, 10:00 UTC of 22 November 2026, and the time between them.
-START = 1_795_341_600_000
-GAP = (START + 90_000, START + 290_000)
-
 #: What arrives again and again, and how often in seconds.
 LIVE = {"web/liveness": 1.0, "online": 1.0, "position": 1.0, "charging-level": 5.0, "sensors/imu": 0.2}
 LIVE |= dict.fromkeys(("touch-sensors", "wheel-odometry", "video-overlays"), 0.1)
@@ -144,23 +141,19 @@ def goob(now: int) -> list[Value]:
     ]
 
 
-def many(count: int, stopped: int, driven: int, away: int, *, video: bool = False) -> Values:
-    """So many robots, of which each ``stopped``-th is stopped, and so on; the later ones have the fuller batteries."""
-
-    def make(now: int) -> list[Value]:
-        values = []
-        for number in range(1, count + 1):
-            ref = f"pebble/robots/robot-{number:04d}"
-            values += robot(now, ref, "mqtt", 7.2 + 0.001 * number, video=video)
-            if number % stopped == 0:
-                values.append((ref, "web/estop", estop(now, "eve on phone"), 0))
-            if number % driven == 0:
-                values.append((ref, "web/driver", driver("bob", "phone"), 0))
-            if number % away == 0:
-                values.append((ref, "web/liveness", liveness(online=False, silent_s=300.0), 0))
-        return values
-
-    return make
+def thousand(now: int) -> list[Value]:
+    """A thousand robots, of which some are stopped, driven or away; the later ones have the fuller batteries."""
+    values = []
+    for number in range(1, 1001):
+        ref = f"pebble/robots/robot-{number:04d}"
+        values += robot(now, ref, "mqtt", 7.2 + 0.001 * number, video=False)
+        if number % 97 == 0:
+            values.append((ref, "web/estop", estop(now, "eve on phone"), 0))
+        if number % 53 == 0:
+            values.append((ref, "web/driver", driver("bob", "phone"), 0))
+        if number % 41 == 0:
+            values.append((ref, "web/liveness", liveness(online=False, silent_s=300.0), 0))
+    return values
 
 
 def fleet(now: int) -> list[Value]:
@@ -282,19 +275,6 @@ def touch(now: int) -> dict[str, Any]:
 
 MINE = at(GOOB, "web/driver", driver("alice", "laptop", you=True))
 DRIVING = State(GOOB_PATH, changed(fleet, MINE), LIVE, logs=logs)
-_ACTS = (
-    ("take", "ann", "phone", "", 1),
-    ("stop", "ann", "phone", "button", 1),
-    ("reset", "bob", "", "", 1),
-    ("release", "ann", "laptop in the hall, on the table", "", 1),
-    ("autonomy", "otto", "laptop", "file apriltag-follow", 1),
-    ("flag", "a-name-that-is-as-long-as-names-may-be", "", "name mqtt-video, on True", 12),
-)
-_ROWS = [
-    {"at": 1_795_341_540 + 11 * n, "ref": GOOB, "address": "10.0.0.7"}
-    | dict(zip(("what", "user", "device", "detail", "count"), act, strict=True))
-    for n, act in enumerate(_ACTS)
-]
 #: May restart robots, and is not logged in.
 OPERATING = replace(
     DRIVING,
@@ -304,7 +284,6 @@ OPERATING = replace(
         "rights": ["drive", "people", "reset", "system", "take"],
         "login": False,
     },
-    audit=[*_ROWS, {**_ROWS[1], "ref": "all"}],
 )
 
 SQUARE = [[0.25, 0.25], [0.75, 0.25], [0.75, 0.75], [0.25, 0.75]]
@@ -324,18 +303,6 @@ def with_stream(address: str) -> Callable[[int], Value]:
     return lambda now: (GOOB, "status", {"t": now, "value": {"webrtc_url": address}}, 100)
 
 
-NO_BOARD = "cannot open /dev/ttyACM0: No such file or directory"
-#: Of goob the motor board is unplugged; of fred it is silent, perhaps by design.
-_BOARDS = {
-    "serial": {"state": "absent", "why": NO_BOARD},
-    "imu": {"state": "ready", "heard_ms": 0},
-    "relays": {"state": "silent", "heard_ms": 10_000},
-}
-UNDRIVEABLE = (
-    at(GOOB, "status", services(mcu=_BOARDS, driveable={"state": "no", "why": f"serial: {NO_BOARD}"})),
-    at(FRED, "status", services(driveable={"state": "unknown", "why": "serial: its board has sent nothing yet"})),
-)
-
 #: The server has recordings.
 REPLAYING = State("/replay?days", fleet, LIVE, {"recordings": True}, recordings=True)
 
@@ -347,8 +314,6 @@ NO_BROKER = {
     "robots_omitted": 0,
     "stops_omitted": False,
 }
-NOT_RECEIVED = "messages come from only 1 of 2 brokers: broker spare.lab:8884 refused us: not authorized"
-ONE_BROKER = NO_BROKER | {"connected": True, "problem": "", "not_received": NOT_RECEIVED}
 UNCONFIRMED = "base has not confirmed it"
 BOB_DRIVES = at(GOOB, "web/driver", driver("bob", "phone", keeps=False))
 
@@ -358,11 +323,6 @@ def keeping(**more: Any) -> Callable[[int], Value]:
     return at(GOOB, "web/driver", driver() | more)
 
 
-#: Goob waits with its pictures while it is driven.
-THIN = (
-    at(GOOB, "link", {"level": "thin", "drive_hz": 4, "rtt_ms": 610, "queue_ms": 40, "t": 1}),
-    at(GOOB, "web/picture", flow("held", "Pictures wait for driving")),
-)
 EVE_STOPPED = (stopped(GOOB, "eve on phone"), stopped(FRED, "eve on phone"))
 
 
@@ -374,21 +334,13 @@ def of(path: str, *changes: Callable[[int], Value], base: Values = fleet, **more
 STATES: dict[str, State] = {
     "fleet": of("/", BOB_DRIVES),
     "fleet-stopped": of("/", stopped(GOOB, "eve on phone"), stopped(FRED, "eve on phone", why="button, all")),
-    "fleet-undriveable": of("/", *UNDRIVEABLE),
-    "undriveable": of(GOOB_PATH, MINE, *UNDRIVEABLE),
-    "fleet-forty": State("/", many(40, 13, 7, 11, video=True), LIVE),
-    "fleet-thousand": State("/", many(1000, 97, 53, 41)),
+    "fleet-thousand": State("/", thousand),
     "fleet-empty": State("/", lambda _now: []),
     "fleet-lost": State("/", fleet, silent=True),
     "driving": DRIVING,
     "operating": OPERATING,
     "recordings": REPLAYING,
-    "replay": replace(REPLAYING, path=f"/replay/{GOOB}?at={START + 30_000}"),
-    "replay-gap": replace(REPLAYING, path=f"/replay/{GOOB}?at={GAP[0] + 60_000}"),
-    "recordings-none": replace(REPLAYING, days=(200, "[]")),
-    "recordings-failed": replace(REPLAYING, days=(422, "/data/recordings: Permission denied")),
-    "recordings-lost": replace(REPLAYING, days=(200, "[]"), silent=True),
-    "driving-recorded": replace(DRIVING, welcome={"recordings": True}),
+    "replay": replace(REPLAYING, path=f"/replay/{GOOB}?at={ms(30)}"),
     "watching": of(f"{GOOB_PATH}?watch", stopped(FRED, "eve on phone")),
     "free": of(GOOB_PATH),
     "odometry": SENSORS,
@@ -398,7 +350,6 @@ STATES: dict[str, State] = {
     "kept": of(GOOB_PATH, keeping(by="bob", device="phone"), welcome=MAY_TAKE),
     "kept-and-asked": of(GOOB_PATH, keeping(by="bob", device="phone", asking=True, others=True), welcome=MAY_TAKE),
     "others-ask": of(GOOB_PATH, keeping(by="alice", you=True, asks="otto")),
-    "others-drive": of(GOOB_PATH, keeping(by="alice", you=True, others=True)),
     "viewer": of(GOOB_PATH, welcome=VIEWER),
     "stopped": of(GOOB_PATH, MINE, *EVE_STOPPED),
     "stop-sent": of(GOOB_PATH, MINE, stopped(GOOB, "", sending="sent", text=UNCONFIRMED)),
@@ -408,24 +359,12 @@ STATES: dict[str, State] = {
     ),
     "lost": State(GOOB_PATH, changed(fleet, MINE), silent=True, freezes=True),
     "no-broker": of(GOOB_PATH, MINE, at("", "web/broker", NO_BROKER)),
-    "one-broker": of(GOOB_PATH, MINE, at("", "web/broker", ONE_BROKER)),
     "silent": of(GOOB_PATH, MINE, SILENT, repeated={}, pictures=False),
     "old-picture": replace(DRIVING, freezes=True),
     "no-picture": of(GOOB_PATH, MINE, at(GOOB, "web/picture", flow("starting")), logs=logs, pictures=False),
-    "thin-link": of(GOOB_PATH, MINE, *THIN, logs=logs, pictures=False),
-    "listening": of(GOOB_PATH, MINE, at(GOOB, "web/sound", sound("flowing", talker="bob")), logs=logs),
-    "no-sound": of(
-        GOOB_PATH, MINE, at(GOOB, "web/sound", sound("refused", "its sound cannot be switched on from here")), logs=logs
-    ),
-    "old-page": replace(DRIVING, welcome={"version": "of another server"}),
-    "plain-http": replace(DRIVING, welcome={"drives": False}),
-    "tower": of(f"/r/{TOWER}"),
     "devices": of(GOOB_PATH, MINE, base=devices, repeated={**LIVE, "mcu/lamp-1/glow": 0.2}),
     "devices-viewer": of(GOOB_PATH, base=devices, welcome=VIEWER),
     "no-camera": of(f"/r/{LAMP}"),
-    "other-camera": of(
-        GOOB_PATH, MINE, at(GOOB, "web/picture-from", {"source": TOWER}), at(TOWER, "web/picture", flow()), logs=logs
-    ),
 }
 
 
@@ -489,8 +428,6 @@ ASKED = changed(
     at(GOOB, "autonomy-status", {"running": False, "timestamp": 1.0, "error": None}, 9000),
 )
 NOT_ARBITRATED = asked(drive={"available": True, "controls": True})
-ENDED = {"running": False, "timestamp": 1.0, "error": "apriltag-follow exited with code 1"}
-BUSY = clip(error="the loudspeaker is busy (talk-back plays)")
 STATES |= {
     "asked": of(GOOB_PATH, MINE, base=ASKED),
     "asked-busy": of(
@@ -500,11 +437,8 @@ STATES |= {
         clip(playing=True, file="speech/number 3.wav"),
         base=ASKED,
     ),
-    "asked-failed": of(GOOB_PATH, MINE, at(GOOB, "autonomy-status", ENDED), BUSY, base=ASKED),
-    "asked-viewer": of(GOOB_PATH, base=ASKED, welcome=VIEWER),
     "script-drives": of(GOOB_PATH, MINE, NOT_ARBITRATED, lambda now: script(now), base=ASKED),
 }
-STATES["map-empty"] = replace(STATES["asked"], values=changed(ASKED, MINE, at(GOOB, "wheel-odometry", {"value": {}})))
 STATES["map-silent"] = replace(SENSORS, values=changed(fleet, *MOVING, SILENT), repeated={}, pictures=False)
 #: All cards that goob has.
 STATES["full"] = replace(SENSORS, values=changed(ASKED, MINE, *MOVING))

@@ -5,15 +5,11 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Awaitable, Callable, Iterator, MutableMapping
-from importlib.resources import files
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import httpx
 import pytest
-from starlette.applications import Starlette
-from starlette.middleware import Middleware
 from starlette.requests import Request
 from starlette.responses import JSONResponse
 from starlette.routing import Route
@@ -21,11 +17,12 @@ from starlette.routing import Route
 from pebble.extensions.fleet import certificates
 from pebble.extensions.fleet.audit import Audit
 from pebble.extensions.fleet.database import DatabaseError
-from pebble.extensions.fleet.people import SESSION_S, People
+from pebble.extensions.fleet.people import SESSION_S
 from pebble.extensions.fleet.roles import Role
 from pebble.extensions.page.access import guard as guard_module
 from pebble.extensions.page.access import login
 from pebble.extensions.page.access.guard import CONTENT_SECURITY_POLICY, FORM, MAX_BODY, Guard
+from pebble.extensions.page.app import create_app
 from pebble.extensions.page.setting import WebSettings
 from pebble.transports import MqttSettings
 from tests.ext.fleet.conftest import cheap_hashes as cheap_hashes
@@ -249,16 +246,13 @@ def test_each_response_has_the_security_headers(guard: Guard) -> None:
 pytestmark = pytest.mark.usefixtures("cheap_hashes")
 PASSWORD = "correct horse"
 URL = {"http": "http://pebble.test:8080", "https": "https://pebble.test:8080"}
-STATIC = files("pebble.extensions.page") / "static"
 
 
 class Site:
-    """The routes of a login behind the guard, and one that names the session."""
+    """The routes of a server that is not connected, and one that names the session."""
 
     def __init__(self, *, login_: bool = True, https: bool = True) -> None:
-        self.people, self.audit = People(None), Audit(None)
-        self.people.add("alice", PASSWORD, Role.DRIVER)
-        self.settings = WebSettings(
+        settings = WebSettings(
             broker=MqttSettings(host="127.0.0.1"),
             names=("pebble.test:8080",),
             server="<fair> & co",
@@ -266,13 +260,11 @@ class Site:
             certificate=Path("server.pem") if https else None,
         )
         self.url = URL["https" if https else "http"]
-        routes = [Route("/who", _who), *login.routes()]
-        self.app = Starlette(routes=routes, middleware=[Middleware(Guard, settings=self.settings)])
-        state = self.app.state
-        state.recognise = lambda *_: None
-        state.settings, state.people, state.audit = self.settings, self.people, self.audit
-        pages = {"login.html": (STATIC / "login.html").read_bytes()}
-        state.static = SimpleNamespace(files=pages, version="0123456789ab")
+        self.app = create_app(settings)
+        self.people, self.audit = self.app.state.people, Audit(None)
+        self.people.add("alice", PASSWORD, Role.DRIVER)
+        self.app.state.audit = self.audit
+        self.app.routes.append(Route("/who", _who))
 
     def run(self, work: Callable[[httpx.AsyncClient], Awaitable[Any]], address: str = "192.0.2.7") -> Any:
         async def inside() -> Any:
@@ -393,6 +385,6 @@ def test_the_page_names_the_server_and_needs_no_session(site: Site) -> None:
     answer = site.run(lambda client: client.get("/login"))
     assert (answer.status_code, answer.headers["cache-control"]) == (200, "no-store")
     assert '<span class="server">&lt;fair&gt; &amp; co</span>' in answer.text
-    assert "./static/0123456789ab/login.js" in answer.text
+    assert f"./static/{site.app.state.version}/login.js" in answer.text
     assert "{" not in answer.text
     assert "style=" not in answer.text

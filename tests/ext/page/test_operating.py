@@ -12,13 +12,10 @@ import pytest
 
 from pebble.errors import TransportError
 from pebble.extensions.operator.client.broker import Broker as BrokerOfPages
-from pebble.extensions.page.open_components import OpenComponents
+from pebble.extensions.page import open_components
 from pebble.extensions.page.robots import Interest, Robots
 from pebble.transports import Message, MqttSettings, QoS, create
-from tests.ext.boards import mcu_wire as wire
 from tests.ext.page.served import Page
-from tests.ext.page.states import described, sample
-from tests.kit.played_robot import RecordingRobot
 from tests.support import Broker, until
 
 
@@ -44,7 +41,7 @@ def test_a_page_that_reads_logs_receives_those_from_before_and_those_that_come(s
         return page.value(robot.base, "status", "value") == text
 
     page.send("watch", ref=robot.base)
-    assert until(lambda: logged("first") and served.app.state.robots.logs[robot.base].after(0))
+    assert until(lambda: logged("first") and served.app.state.server.robots.logs[robot.base].after(0))
     assert page.logs == []  # it has not asked
     page.send("read-logs", ref=robot.base, on=True)
     assert until(lambda: lines(page))
@@ -75,21 +72,6 @@ def test_flags_are_those_of_the_broker(page, robot, broker) -> None:
     assert until(lambda: flags() == {"remote_mirror": None, "mqtt_audio": None, "mqtt_video": True})
 
 
-# -- microcontrollers
-
-
-def test_what_an_mcu_publishes_under_an_alias_arrives(page: Page, robot: RecordingRobot) -> None:
-    page.send("watch", ref=robot.base)
-    robot.publish("mcu/lamp-1/describe", described(wire.LAMP), retain=True)
-    robot.publish("lights/lamp", sample("lamp-1", "lamp", {"level": 62.5}), retain=True)
-    assert until(lambda: page.value(robot.base, "lights/lamp", "value") == {"level": 62.5})
-    assert page.value(robot.base, "mcu/lamp-1/describe", "device_uid") == "lamp-1"
-    robot.publish("lights/other", {"value": 1}, retain=True)
-    robot.publish("mcu/lamp-1/glow", sample("lamp-1", "glow", {"lux": 1.5}))
-    assert until(lambda: page.value(robot.base, "mcu/lamp-1/glow", "value") == {"lux": 1.5})
-    assert page.value(robot.base, "lights/other") is None
-
-
 # -- opened and closed
 
 
@@ -104,7 +86,7 @@ class Opened:
         self.may_unsubscribe, self.loop = asyncio.Event(), asyncio.get_running_loop()
         self.robots, self.tasks = Robots(), list[asyncio.Future[None]]()
         spawn = lambda work: self.tasks.append(asyncio.ensure_future(work))
-        self.components = OpenComponents(cast(BrokerOfPages, self), self.robots, spawn, keep_s=0, step_s=0)
+        self.components = open_components.OpenComponents(cast(BrokerOfPages, self), self.robots, spawn)
 
     def on_state(self, watcher: Callable[[], None]) -> None:
         pass
@@ -189,7 +171,11 @@ STORIES = (
 
 
 @pytest.mark.parametrize("story", STORIES)
-def test_components_that_are_opened_and_closed(story: Callable[[], Coroutine[Any, Any, None]]) -> None:
+def test_components_that_are_opened_and_closed(
+    monkeypatch: pytest.MonkeyPatch, story: Callable[[], Coroutine[Any, Any, None]]
+) -> None:
+    for name in ("KEEP_S", "STEP_S"):
+        monkeypatch.setattr(open_components, name, 0)
     asyncio.run(story())
 
 

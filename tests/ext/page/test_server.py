@@ -18,12 +18,10 @@ from pebble.extensions.operator.client.robot_view import RobotView
 from pebble.extensions.page import robots as robots_module
 from pebble.extensions.page.drive.driven_robot import Tab
 from pebble.extensions.page.log_lines import MAX_BYTES, MAX_LINE_BYTES, MAX_LINES, PART_BYTES, LogLines, line_of
-from pebble.extensions.page.robots import MAX_ALIASES, Interest, Robots
+from pebble.extensions.page.robots import Interest, Robots
 from pebble.extensions.page.server import Server
 from pebble.extensions.page.setting import WebSettings
 from pebble.transports import Message, MqttSettings
-from tests.ext.boards import mcu_wire as wire
-from tests.ext.page.states import described
 
 _CAPABILITIES = {"t": 1, "value": {"drive": {"available": True}, "estop": {"available": True, "owners": ["serial"]}}}
 
@@ -163,37 +161,6 @@ def test_large_values_are_sent_one_at_a_time() -> None:
 DESCRIBE = "mcu/lamp-1/describe"
 
 
-def manifest(*channels: Any) -> dict[str, Any]:
-    interfaces = [{"name": f"i{n}", "dir": "out", "channel": channel} for n, channel in enumerate(channels)]
-    return described(wire.LAMP) | {"interfaces": interfaces}
-
-
-#: What is defined elsewhere, or cannot be a part of a topic.
-NO_ALIASES = [
-    "", 1, None, {"a": 1}, "front-camera", "logs", "estop/base", "estops", "control/x", "by/x", "web/estop", "web",
-    "mcu/other/lamp", "a/#", "a/+/b", "/a", "a//b", "$SYS", "a\0b", "a" * 65, "/".join(["a" * 30] * 8),
-]  # fmt: skip
-
-
-def test_only_a_free_channel_becomes_an_alias() -> None:
-    def aliases(channel: Any) -> list[str]:
-        robots = Robots()
-        robots.receive(published(GOOB, DESCRIBE, manifest(channel, channel)), 1.0)
-        return robots.aliases(GOOB)
-
-    assert [one for one in NO_ALIASES if aliases(one)] == []
-    # the first one is the contract's in the other direction only: nothing arrives there
-    assert [aliases(one) for one in ("drive-values", "a/b")] == [["drive-values"], ["a/b"]]
-
-
-def test_a_manifest_of_any_shape_is_read() -> None:
-    for payload in ([], {}, {"interfaces": 1}, {"interfaces": [1, None, {}, {"dir": "in", "channel": "a/b"}]}):
-        robots = Robots()
-        robots.receive(published(GOOB, DESCRIBE, payload), 1.0)
-        assert robots.aliases(GOOB) == []
-        assert robots.value(GOOB, DESCRIBE) is not None
-
-
 FIELD = {"name": "x", "type": "u8"}
 INTERFACE = {"name": "a", "dir": "out", "encoding": {"fields": [FIELD]}}
 BARE = {"model": "", "firmware_version": "", "interfaces": []}
@@ -242,23 +209,27 @@ def test_pages_get_a_value_without_the_bytes_around_it() -> None:
     assert robots.value(GOOB, "status") is not None
 
 
-def test_there_is_an_end_to_aliases() -> None:
-    robots = Robots()
-    for device in range(4):
-        many = manifest(*(f"x/{device}-{n}" for n in range(100)))
-        robots.receive(published(GOOB, f"mcu/m{device}/describe", many), 1.0)
-    assert len(robots.aliases(GOOB)) == MAX_ALIASES
+ODD = (
+    b"", b"\xff\xfe", b'{"value":NaN}', b'{"t":1e999}', b'{"value":"\\ud800"}', b"[" * 60_000, b"9" * 60_000,
+    b'{"value":"%s"}' % (b"x" * 70_000),
+)  # fmt: skip
 
 
-def test_aliases_end_with_their_manifest() -> None:
+@pytest.mark.parametrize("metric", ["status", "wheel-odometry", "logs", DESCRIBE, "autonomy-status", "capabilities"])
+def test_whatever_a_robot_publishes_pages_get_json(metric: str) -> None:
     robots = Robots()
-    interest = Interest(lambda: None)
+    for payload in ODD:
+        robots.receive(published(GOOB, metric, payload), 1.0)
+        json.loads(bytes(robots.value(GOOB, metric) or b"null"), parse_constant=pytest.fail, parse_int=str)
+
+
+def test_a_value_ends_with_an_empty_message() -> None:
+    robots, interest = Robots(), Interest(lambda: None)
     robots.join(interest)
     robots.watch(interest, GOOB)
-    robots.receive(published(GOOB, DESCRIBE, manifest("a/b")), 1.0)
+    robots.receive(published(GOOB, DESCRIBE, {}), 1.0)
     assert [value[:2] for value in robots.take(interest, 2.0, large=False)[0]] == [(GOOB, DESCRIBE)]
     robots.receive(published(GOOB, DESCRIBE, b""), 1.0)
-    assert robots.aliases(GOOB) == []
     assert robots.take(interest, 3.0, large=False) == (((GOOB, DESCRIBE, None, 0.0),), False)
 
 
@@ -285,11 +256,6 @@ def test_lines_are_numbered_from_1_sent_once_and_leave_a_gap_where_some_are_drop
     lines = taken(b'{"message":"a"}', b'"b"', b'"' + b"x" * MAX_LINE_BYTES + b'"', b'"c"')
     runs = [[(1, ["a", "b"]), (4, ["c"])], [(2, ["b"]), (4, ["c"])], [(4, ["c"])]]
     assert [read(lines, after) for after in range(3)] == runs
-
-
-def test_a_page_that_is_too_slow_sees_from_where_there_are_lines() -> None:
-    runs = read(taken(*(str(number).encode() for number in range(MAX_LINES + 20))), 5)
-    assert (runs[0][0], sum(len(run) for _, run in runs)) == (21, MAX_LINES)
 
 
 def test_plain_text_becomes_a_string() -> None:

@@ -24,8 +24,6 @@ from pebble.errors import ConfigError
 from pebble.extensions.fleet.audit import Audit
 from pebble.extensions.fleet.people import People
 from pebble.extensions.fleet.roles import Role
-from pebble.extensions.operator.client import page_packages
-from pebble.extensions.page import run as process
 from pebble.extensions.page.setting import WebSettings, settings_of
 from tests.commands.command_line import Run, config_file, program
 from tests.kit.terminal import Terminal
@@ -174,16 +172,6 @@ def test_users(run: Run, monkeypatch: pytest.MonkeyPatch, state: Path) -> None:
     people.close()
 
 
-def test_mistakes_with_users(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Refuse at the prompt; the rules for names and passwords are tested where people are kept."""
-    give(monkeypatch, "")
-    assert run("web", "user", "add", "alice") == 1
-    assert run.err.startswith("pebble: no password: enter it at the prompt")
-    assert run("web", "user", "add", "alice", SECRET) == 2
-    assert run("web", "user", "role", "bob", "admin") == 1
-    assert run.err == "pebble: there is no 'bob': `pebble web user list` lists the names\n"
-
-
 def test_audit(run: Run, state: Path) -> None:
     log = Audit(state / "people.sqlite")
     log.write("drive", ref="pebble/robots/goob", user="alice", device="phone", address="10.0.0.2")
@@ -209,17 +197,6 @@ def test_a_certificate_is_made_with_what_to_type_next_and_how_phones_trust_it(ru
     assert "https://lab-pc.local:PORT/ca.pem" in run.out
     assert sorted(path.name for path in state.iterdir()) == ["ca.key", "ca.pem", "server.key", "server.pem"]
     assert stat.S_IMODE((state / "ca.key").stat().st_mode) == 0o600
-
-
-def test_a_certificate_is_shown_renewed_and_never_overwritten(run: Run, tmp_path: Path) -> None:
-    folder = tmp_path / "tls"
-    run("cert", "init", "--folder", folder, "lab-pc.local", "::1")
-    assert run("cert", "show", "--folder", folder) == 0
-    assert f"{folder}/server.pem\n    for lab-pc.local, ::1\n" in run.out
-    assert run("cert", "renew", "--folder", folder, "other.local") == 0
-    assert "is for other.local until" in run.out
-    assert run("cert", "init", "--folder", folder, "lab-pc.local") == 1
-    assert run.err.startswith(f"pebble: {folder}/ca.pem exists: `pebble cert renew --folder {folder}`")
 
 
 # -- the real server
@@ -325,15 +302,6 @@ def test_a_missing_broker_is_named() -> None:
     assert 'the robot\'s own connection is "zenoh"' in problem({}, **ZENOH)
 
 
-def test_users_that_cannot_be_read_hide_no_other_problem(tmp_path: Path) -> None:
-    raw = {"robot": {"id": "goob"}, "web_interface": {"host": "0.0.0.0", "people": str(tmp_path)}, **REMOTE}
-    with pytest.raises(ConfigError) as caught:
-        process.settings_or_all_problems(parse(raw, folder=tmp_path, env={}))
-    first, second = caught.value.problems
-    assert first.startswith("web_interface.host: other machines reach 0.0.0.0")
-    assert second.startswith(f"{tmp_path}: ")
-
-
 def test_a_certificate_needs_its_files(tmp_path: Path) -> None:
     tls = {"certificate": "server.pem", "key": "server.key", "ca": "ca.pem"}
     web = {"host": "0.0.0.0", "tls": tls, "names": ["fair.local"], "server": "fair"}
@@ -362,14 +330,6 @@ def written(folder: Path, web: dict[str, Any]) -> Path:
     }
     path.write_text(json.dumps(raw))
     return path
-
-
-def test_missing_packages_are_named_with_the_command_that_installs_them(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(page_packages, "find_spec", lambda name: None if name == "uvicorn" else object())
-    assert process.main([str(written(tmp_path, {"mqtt": {"host": "127.0.0.1"}}))]) == 1
-    assert "(uvicorn): pip install 'pebble-robot[web]'" in caplog.text
 
 
 def test_it_reports_that_it_is_ready_and_alive_and_ends_by_a_signal(tmp_path: Path, broker: Broker) -> None:

@@ -56,7 +56,7 @@ class MediaHub(Streams[PictureStream]):
         key = self._key(ref)
         if key is None:
             return None
-        jpeg = await asyncio.to_thread(rescue.newest_jpeg, [key.payload])
+        jpeg = await asyncio.to_thread(rescue.jpeg_of, key.payload)
         return None if jpeg is None else (jpeg, key.received_at)
 
     async def look_in_turn(self) -> None:

@@ -32,9 +32,9 @@ def unavailable(encoding: str) -> str:
     return f"this server cannot convert h264: it {pyav.INSTALL}" if encoding == "h264" and not pyav.installed() else ""
 
 
-def newest_jpeg(payloads: Sequence[bytes]) -> bytes | None:
-    """Return the last picture of a key frame and its differences, in full size. Call it on a thread."""
-    decoded = _newest(_make_decoder(), payloads)
+def jpeg_of(key_frame: bytes) -> bytes | None:
+    """Return a key frame's picture in full size. Call it on a thread."""
+    decoded = _make_decoder().feed(key_frame)
     return None if decoded is None else _encode(decoded.picture)
 
 
@@ -87,15 +87,10 @@ def _make_decoder() -> VideoDecoder:
 
 
 def _convert(decoder: VideoDecoder, payloads: Sequence[bytes]) -> RescuedPicture | None:
-    newest = _newest(decoder, payloads)
-    return None if newest is None else RescuedPicture(_encode(newest.picture, WIDTH), newest.captured_ms or 0)
-
-
-def _newest(decoder: VideoDecoder, payloads: Sequence[bytes]) -> Decoded | None:
     newest: Decoded | None = None
     for payload in payloads:
         newest = decoder.feed(payload) or newest
-    return newest
+    return None if newest is None else RescuedPicture(_encode(newest.picture, WIDTH), newest.captured_ms or 0)
 
 
 def _encode(picture: Any, width: int | None = None) -> bytes:

@@ -8,7 +8,7 @@ from typing import Any
 
 from pebble.extensions.operator.client.forms import Setting
 from tests.ext.boards import mcu_wire as wire
-from tests.ext.page.in_node import Rows, Script, evaluate, rows
+from tests.ext.page.in_node import Rows, Script, rows
 from tests.ext.page.states import described
 
 _STORED = """
@@ -66,15 +66,16 @@ WHY_NO_FLASH = {
     "values[ref].capabilities.value.lights.flash = false": NO_FLASH,
     "delete values[ref]": NO_FLASH,
 }
-ODD = '{"colour":"url(x)","period":"2","mode":"boom","steady":[]}'
 # fmt: off
 LIGHTS: Rows = {
-    "a dragged colour is sent now and at last": ("""
-        const one = lightsOf(ref), timers = [];
-        globalThis.setTimeout = (fn) => timers.push(fn);
-        for (let blue = 10; blue < 30; blue++) one.ask(page, { colour: `#0000${blue}` });
-        timers.forEach((fn) => fn());
-        result = sent.map(({ b }) => b);""", [0.063, 0.161]),
+    "a refusal does not undo what was asked after it": (f"""{_ANSWER}
+        one.ask(page, {{ mode: "solid" }});
+        one.sentAt = -Infinity;
+        one.ask(page, {{ mode: "off" }});
+        answer(1, "refused");
+        result = [lit()[0]];
+        answer(2, "done");
+        result.push(lit()[0], followers.size);""", ["off", "off", 0]),
     **{f"what is asked of lights: {change}": (f"lightsOf(ref).ask(page, {change}); result = sent;", [expected])
         for change, expected in ASKED.items()},
     **{f"a flash ends in what was before: {before}": (f"""
@@ -93,17 +94,6 @@ LIGHTS: Rows = {
         page.commands.setLights = () => 0;
         one.ask(page, {{ mode: "off" }});
         result.push(lit());""", ["", ["flash", "#0000ff"], ["solid", "#0000ff"], 0, ["solid", "#0000ff"]]),
-    "a refusal does not undo what was asked after it": (f"""{_ANSWER}
-        one.ask(page, {{ mode: "solid" }});
-        one.sentAt = -Infinity;
-        one.ask(page, {{ mode: "off" }});
-        answer(1, "refused");
-        result = [lit()[0]];
-        answer(2, "done");
-        result.push(lit()[0], followers.size);""", ["off", "off", 0]),
-    "lights that only flash are off in black": ("""
-        values[ref].capabilities.value.lights = { solid: false, flash: true };
-        lightsOf(ref).ask(page, { mode: "off" }); result = sent;""", [BLACK | {"period": 2}]),
     "a flash of a silent robot can be switched off": ("""
         const one = lightsOf(ref);
         one.ask(page, { mode: "flash" });
@@ -111,13 +101,6 @@ LIGHTS: Rows = {
         result = [toggleFlash(page, ref), one.mode, toggleFlash(page, ref)];""", ["", "off", "goob is silent"]),
     **{f"why lights do not flash: {change}": (f"{change}; result = [toggleFlash(page, ref), sent];", [why, []])
         for change, why in WHY_NO_FLASH.items()},
-    "what lights can do": ("""
-        result = [{ solid: true }, { available: true, flash: false }, { solid: "yes", available: 1 }].map(
-          (lights) => Object.values(supported({ value: { lights } })));""",
-        [[True, False], [True, False], [False, False]]),
-    "lights ignore what they cannot have remembered": (f"""
-        globalThis.localStorage = {{ getItem: () => {json.dumps(ODD)}, setItem() {{}} }};
-        result = Object.values(new Lights("other").state);""", ["#ff8800", 2, "", "off"]),
 }
 # fmt: on
 
@@ -135,15 +118,15 @@ GROUPS = [
 ]
 # fmt: off
 SOUNDS: Rows = {
-    "the last sound is repeated as it was played": ("""
-        result = [repeatLast(page, ref), play(page, ref, "a/horn.wav", true), repeatLast(page, ref),
-          repeatLast(page, "pebble/robots/fred"), sent];""",
-        ["Play one sound first", "", "", "Play one sound first", [["a/horn.wav", True]] * 2]),
     "what cannot be played is not repeated": ("""
         result = [play(page, ref, "x".repeat(1001), false), repeatLast(page, ref)];
         values[ref].capabilities.value.soundboard.controls = false;
         result.push(play(page, ref, "horn.wav", false), repeatLast(page, ref), sent);""",
         ["Its name is too long", "Play one sound first", *["goob takes no such commands"] * 2, []]),
+    "the last sound is repeated as it was played": ("""
+        result = [repeatLast(page, ref), play(page, ref, "a/horn.wav", true), repeatLast(page, ref),
+          repeatLast(page, "pebble/robots/fred"), sent];""",
+        ["Play one sound first", "", "", "Play one sound first", [["a/horn.wav", True]] * 2]),
     **{f"{most} clips with '{words}' are grouped by folder": (
         f"result = grouped({json.dumps(FILES)}, '{words}', {most});", {"folders": folders, "more": more})
         for words, most, folders, more in GROUPS},
@@ -179,33 +162,18 @@ HINTS = [
 NOT_STORED = '[[1,2,3],["goob","a",{"x":1}],["goob","a",[["x",1]]],null]'
 # fmt: off
 FORMS: Rows = {
+    "a memory of something else is none": (f"""
+        stored.set("pebble forms", {json.dumps(NOT_STORED)}); result = texts(remembered("goob", "a"));""", {}),
     "what was filled in is sent in the types of JSON": (f"""
         result = [{{ tag: "7" }}, {json.dumps(GIVEN)}].map(
           (texts) => filled({json.dumps(ALL)}, new Map(Object.entries(texts))));""", [{"tag": 7}, SENT]),
     "hints": (f"result = {json.dumps([one for one, _ in HINTS])}.map(hint);", [expected for _, expected in HINTS]),
-    "scripts of one label have their files behind": ("""
-        const named = (file, label) => ({ file, label, configs: [] });
-        result = scripts({ files: [named("a", "Follow"), named("b", "Follow"), named("c", "Go")] })
-          .map((one) => one.label);""", ["Follow (a)", "Follow (b)", "Go"]),
-    "three settings come first, those that a script names, and what must be filled in": ("""
-        const configs = ["a", "b", "c", "d"].map((key) => ({ key }));
-        configs.push({ key: "e", required: true, default: null });
-        result = [undefined, ["c", "b"], ["gone"], ["e", "d", "c", "b"]].map((main) => {
-          const [one] = scripts({ files: [{ file: "x", configs, main }] });
-          return [one.main, one.more].map((fields) => fields.map(({ key }) => key).join("")).join(" ");
-        });""", ["abce d", "cbe ad", "abce d", "edc ab"]),
     "forms are remembered by robot and script": ("""
         remember("goob", "a", new Map([["x", "1"]]));
         remember("goob", "b", new Map([["x", "2"]]));
         remember("fred", "a", new Map([["x", "3"]]));
         result = [texts(remembered("goob", "a")), texts(remembered("goob", "b")), texts(remembered("fred", "b"))];""",
         [{"x": "1"}, {"x": "2"}, {}]),
-    "the memory of forms is bounded": ("""
-        for (let n = 0; n < 40; n++) remember("goob", `script ${n}`, new Map([["x", "y".repeat(200)]]));
-        result = [JSON.parse(stored.get("pebble forms")).length, texts(remembered("goob", "script 39")).x.length];""",
-        [32, 200]),
-    "a memory of something else is none": (f"""
-        stored.set("pebble forms", {json.dumps(NOT_STORED)}); result = texts(remembered("goob", "a"));""", {}),
 }
 # fmt: on
 
@@ -270,23 +238,12 @@ MAY: Rows = {
 # fmt: on
 
 
-def test_the_newest_answers_are_remembered_by_the_number_of_the_command() -> None:
-    steps = """
-    const connection = new Connection("v");
-    const answer = (n, op) => connection.answered({ op, cmd: "outlet", ref: "a", n, why: "no" });
-    for (let n = 1; n <= 500; n++) answer(n, "done");
-    answer(0, "refused");
-    const { answers } = connection;
-    result = [answers.get(500).op, answers.size, answers.has(300)];"""
-    assert evaluate({"ui/parts/models.js": "Connection"}, steps) == ["done", 200, False]
-
-
 # -- manifests of microcontrollers, what a robot offers, and outlets
 
 cards = Script(
     {
         "core/stream.js": "refusal",
-        "ui/cards/manifest.js": "command, range, step, unsendable",
+        "ui/cards/manifest.js": "range, step, unsendable",
         "ui/cards/outlets.js": "outletsOf, obstacle",
         "ui/parts/models.js": "Offers",
     }
@@ -299,26 +256,12 @@ def of(expression: str, *values: Any) -> str:
 
 
 PRIVATE = wire.M("m", (wire.I(1, "a", wire.IN, wire.KIND_COMMAND, (wire.F("x", wire.U8),), flags=wire.LOCAL_ONLY),))
-#: Fields, what is entered, and the value of the field's type.
-ENTERED: list[tuple[dict[str, Any], Any, Any]] = [
-    ({"type": "bool"}, True, True),
-    ({"type": "bool"}, None, False),
-    ({"type": "f32"}, "1.5e3", 1500),
-]
 #: Fields, and the least and the greatest value, and the step.
 RANGES: list[tuple[dict[str, Any], Any, str]] = [
     *[({"type": f"u{bits}"}, [0, 2**bits - 1], "1") for bits in (8, 16, 32)],
-    *[({"type": f"i{bits}"}, [-(2 ** (bits - 1)), 2 ** (bits - 1) - 1], "1") for bits in (8, 16, 32)],
     ({"type": "u8", "scale": 0.5}, [0, 127.5], "0.5"),
-    ({"type": "u8", "scale": 3}, [0, 765], "3"),
     ({"type": "i16", "scale": -0.1, "offset": 10}, [-3266.7, 3286.8], "any"),
     ({"type": "f32"}, None, "any"),
-]
-#: What capabilities list of *drive*, and whether there are controls for an axis besides turning and going.
-AXES: list[tuple[Any, bool]] = [
-    ({"drive": {"available": True, "axes": ["x", "z"]}}, False),
-    ({"drive": {"available": True}}, True),  # it does not list them: it may have any
-    (None, True),  # no capabilities
 ]
 OFFERED = {"value": {"outlets": {"available": True, "outlets": [{"name": "o1", "controls": False}, {"name": "o2"}]}}}
 #: Capabilities, metrics, and the outlets, and whether each can be switched.
@@ -355,15 +298,9 @@ CARDS: Rows = {
     **{f"what takes commands has fields of known types: {kind}": (
         of("unsendable(v[0])", {"encoding": {"fields": [{"name": "x", "type": kind}]}}), why)
         for kind, why in {**dict.fromkeys(("bool", "f32", "u8"), ""), "f64": "x is of an unknown type"}.items()},
-    **{f"controls for an extra axis: {value}": (
-        of("new Offers('pebble/robots/a', v[0]).hasExtraAxis", value and {"value": value}), expected)
-        for value, expected in AXES},
     **{f"outlets are those that are listed and those that report: {metrics}": (of("""Object.fromEntries(
         outletsOf(new Offers('pebble/robots/a', v[0], v[1])).map(({ name, controls }) => [name, controls]))""",
         capabilities, metrics), expected) for capabilities, metrics, expected in OUTLETS},
-    **{f"what is entered becomes JSON of the field's type: {field} {entered}": (of(
-        "command(v[0], new Map(v[1])).x", {"encoding": {"fields": [field | {"name": "x"}]}}, [["x", entered]]), value)
-        for field, entered, value in ENTERED},
     **{f"what a field can hold: {field}": (of("[range(v[0]), step(v[0])]", field), [limits, step])
         for field, limits, step in RANGES},
     **{f"why {name[:8]} {controls} {report} cannot be switched": (

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from pebble.extensions.operator.client.drive_reasons import WORDS
-from tests.ext.page.in_node import STATIC, Rows, Script, evaluate, rows
+from tests.ext.page.in_node import Rows, Script, evaluate, rows
 
 # -- gestures: what is sent is listed as [gesture, sum of the axes, final]; all but z are 0
 
@@ -283,15 +283,16 @@ PRESSES = {
 }
 # fmt: off
 ACTIONS: Rows = {
+    "what is not held is done each time": ('key("KeyF"); key("KeyF");', [["flash", "down"]] * 2),
+    "only the speed is repeated":
+        ('key("NumpadAdd", { key: "+", repeat: true }); key("KeyF", { repeat: true });', [["faster", "down"]]),
+    "keys are named as they are printed": ("""
+        const azerty = new Map([["KeyW", "z"]]); result = [keyName("KeyW", azerty), keyName("KeyW"),
+        keyName("ArrowUp", azerty), buttonName(3, true), buttonName(3, false)];""", ["Z", "W", "↑", "Y", "button 4"]),
     **{f"what {press} does": (press, [[action, "down"]]) for press, action in PRESSES.items()},
-    "what is held ends once when its key is released": ("""
-        key("KeyT"); key("KeyT", { repeat: true }); actions.keyUp("KeyF"); actions.keyUp("KeyT");
-        actions.keyUp("KeyT");""", [["talk", "down"], ["talk", "up"]]),
     "what is held ends with a gesture and a repetition does not begin it again": (
         'key("KeyT"); actions.clear(); key("KeyT", { repeat: true }); actions.keyUp("KeyT"); key("KeyF");',
         [["talk", "down"], ["talk", "up"], ["flash", "down"]]),
-    "only the speed is repeated":
-        ('key("NumpadAdd", { key: "+", repeat: true }); key("KeyF", { repeat: true });', [["faster", "down"]]),
     "on the fleets screen there is only the help": (
         'open = false; key("KeyT"); key("KeyF"); seen(pad(), pad(3)); key("Slash", { key: "?" });',
         [["help", "down"]]),
@@ -301,26 +302,16 @@ ACTIONS: Rows = {
         failing.keyDown({ code: "KeyT", key: "t", repeat: false });
         failing.clear();
         result = "went on";""", "went on"),
-    "the buttons of a gamepad act when they are pressed": (
-        "seen(pad(), pad(3), pad(3), pad(), pad(4), pad(5), pad(12), pad(13));",
-        [[one, "down"] for one in ("flash", "mute", "repeat", "faster", "slower")]),
     "talking lasts as long as its button is held":
         ("seen(pad(), pad(6), pad(6), pad());", [["talk", "down"], ["talk", "up"]]),
     **{f"talking by gamepad ends with what ends a gesture: {end}": (
         f"seen(pad(), pad(6)); {end}; seen(pad(6), pad(6));", [["talk", "down"], ["talk", "up"]])
         for end in ("seen(null)", "actions.clear()", "seen({ ...pad(6), index: 1 })")},
-    "other keys have none":
-        ('result = [key("KeyX"), key("Slash", { key: "/" }), key("KeyW"), key("Space")];', [False] * 4),
     "a button that is pressed when a gamepad appears does nothing":
         ("seen(pad(3), pad(3), pad(), null, pad(3), pad(3));", []),
-    "a mapping moves an action to another button":
-        ("usual.buttons = { flash: 7, mute: -1 }; seen(pad(), pad(3, 4), pad(7));", [["flash", "down"]]),
     "every binding is in the table once, and none is a stop's": ("""
         const keys = ACTIONS.flatMap((one) => one.keys ?? []), buttons = ACTIONS.flatMap((one) => one.button ?? []);
         result = [new Set(keys).size - keys.length, new Set([...buttons, 8, 9]).size - buttons.length];""", [0, 2]),
-    "keys are named as they are printed": ("""
-        const azerty = new Map([["KeyW", "z"]]); result = [keyName("KeyW", azerty), keyName("KeyW"),
-        keyName("ArrowUp", azerty), buttonName(3, true), buttonName(3, false)];""", ["Z", "W", "↑", "Y", "button 4"]),
 }
 # fmt: on
 
@@ -366,69 +357,14 @@ MAPPING: Rows = {
             "[0, 0, 0.15, 0.15]": [0, 0, 0],  # within the dead zone
             "[0, 0, 0.575, -0.575]": [pytest.approx(0.5), pytest.approx(0.5), 0],
         }.items()},
-    "the usual one has the first two axes": ("result = seen(pad([1, -1, 0, 0]), USUAL);", [1, 1, 0]),
     "axes that are no numbers are none": ('result = seen(pad([0, 0, NaN, "1"]));', []),
-}
-# fmt: on
-
-
-# -- what is joined to the page later; ``later`` runs what it does each second
-
-_MORE = """
-const define = (name, value) => Object.defineProperty(globalThis, name, { value, configurable: true });
-let dialog = null;
-let later;
-const seen = [];
-define("location", { search: "" });
-define("document", {
-  querySelector: () => dialog, createElement: () => ({}), head: { append() {} }, addEventListener() {},
-  documentElement: { toggleAttribute() {} },
-});
-const lock = { released: false, release() { seen.push("off"); this.released = true; } };
-const request = async () => (seen.push("on"), Object.assign(lock, { released: false }));
-define("navigator", { wakeLock: { request } });
-define("setInterval", (run) => (later = run));
-define("fetch", async () => seen.push("reload"));
-const driver = { ref: "pebble/robots/goob", lease: {}, sliders: { speed: 0.5 }, changed() {}, onChange() {} };
-const panels = { toggle: (name) => seen.push(name) };
-const connection = { isOpen: true, show() {}, socket: { send: () => false } };
-const page = { driver, connection, store: { get: () => undefined }, panels, commands: {} };
-const key = (code, key = code) => driver.actions.keyDown({ code, key, repeat: false });
-const turn = () => new Promise((resolve) => setImmediate(resolve));
-"""
-_INSTALL = f"""
-const {{ install }} = await import("{(STATIC / "ui" / "more.js").as_uri()}");
-install(page);
-page.sound.model = {{ toggleMute: () => seen.push("mute") }};
-"""
-
-
-more = Script({}, _MORE + _INSTALL, "await turn();\nresult = seen;")
-
-
-# fmt: off
-MORE: Rows = {
-    "behind an open panel there is only the help":
-        ('key("KeyM"); dialog = {}; key("KeyM"); key("Slash", "?");', ["mute", "help"]),
-    "the screen stays on while this page has control": ("""
-        let you = false; page.store.get = () => ({ value: { you } });
-        for (you of [false, true, true, false, false, true]) { later(); await turn(); }
-        lock.released = true; later();""", ["on", "off", "on", "on"]),
-    "keys change the speed": ("""
-        for (const [code, times] of [["NumpadAdd", 1], ["NumpadAdd", 9], ["Minus", 1], ["Minus", 9]]) {
-          for (let n = 0; n < times; n++) key(code, code === "Minus" ? "-" : "+");
-          await turn(); seen.push(driver.sliders.speed);
-        }""", [0.6, 1, 0.9, 0.05]),
-    "a command that was not sent has no number": ("seen.push(page.commands.setLights(driver.ref, {}));", [0]),
-    "a page that a person uses is not loaded anew by itself": (
-        "connection.isOld = true; for (const now of [1e6, 2e6]) { performance.now = () => now; later(); }", []),
 }
 # fmt: on
 
 
 @rows(
     (gesture, GESTURE), (inputs, INPUTS), (reasons, REASONS), (actions, ACTIONS), (denying, DENYING),
-    (mapping, MAPPING), (more, MORE),
+    (mapping, MAPPING),
 )  # fmt: skip
 def test_each(found: Callable[[], Any], expected: Any) -> None:
     assert found() == expected

@@ -36,40 +36,22 @@ def stated(**identity: Any) -> str:
 # fmt: off
 WHOLE = {"name": "Otto", "description": "A boat", "colour": "rose", "picture": "boat"}
 FACES: Rows = {
+    "what is long is cut": (
+        f"const one = look('r7', {stated(name='x' * 40, description='y' * 99)}); result = [one.name, one.description];",
+        ["x" * 32 + " (r7)", "y" * 60]),
     "it looks as it says": (
         f"result = look('otto', {stated(**WHOLE, battery_cells=2)});", {**WHOLE, "cells": 2}),
     "a name that is not its id has it behind": (
         f"result = ['mini-lamp', 'fred'].map((id) => look(id, {stated(name='Mini Lamp')}).name);",
         ["Mini Lamp", "Mini Lamp (fred)"]),
-    "the original's robots are known": (
-        "result = ['goob', 'bumperbot'].map((id) => look(id)).map((one) => [one.colour, one.picture]);",
-        [["blue", "goob"], ["green", "benjr"]]),
-    "what drives has wheels": (f"result = look('r7', {stated()}).picture;", "wheeled"),
-    "an outlet is one": ("result = look('r7', { value: { outlets: { available: true } } }).picture;", "outlets"),
     "another is unknown, and has a colour": ("result = brief(look('r7', null));", ["r7", "unknown", "string", 0]),
     "what is no look is not used": (
         f"result = brief(look('constructor', {stated(colour='url(x)', picture='__proto__', battery_cells=-1)}));",
         ["constructor", "wheeled", "string", 0]),
-    "what is long is cut": (
-        f"const one = look('r7', {stated(name='x' * 40, description='y' * 99)}); result = [one.name, one.description];",
-        ["x" * 32 + " (r7)", "y" * 60]),
-    "robots have faces": ("result = ['robots', 'towers'].map((type) => hasFace(`pebble/${type}/a`));", [True, False]),
     "a name steers nothing": (f"result = look('r7', {stated(name=chr(0x202E) + 'x')}).name;", "\\u202ex (r7)"),
     "a battery is in percent where its cells are known": (
         "result = [[8.4, 2], [6, 2], [7.64, 2], [9, 2], [8, 0]].map(([value, cells]) => percent(value, 'V', cells));",
         [100, 0, 50, 100, None]),
-    "or where it says percent": (
-        "result = [percent(81, '%', 0), percent('x', 'V', 2), charge(undefined, 2)];", [81, None, None]),
-    "or as it says": (
-        "result = [{ value: 7.918, unit: 'v' }, { value: 81, unit: '%' }, 5, null].map((one) => battery(one));",
-        ["7.92 V", "81.0 %", "5.0", "–"]),
-    "how long anything was": (
-        "result = [68, 5200, 18_000, 18 * 60_000, 3 * 3_600_000, 2 * 86_400_000].map(span);",
-        ["68 ms", "5.2 s", "18 s", "18 min", "3 h", "2 days"]),
-    "where its stream is": (
-        "result = [{ value: { webrtcUrl: 'http://a' } }, { url: 5 }, null].map(reported);", ["http://a", "", ""]),
-    "whether it charges is known or not": (
-        "result = [true, false, 'x'].map((value) => charging({ value }));", ["charging", "not charging", ""]),
     "any value of it is one line": ("""
         result = [1234.5678, 123_456.7, null, undefined, true, [1, { a: 2 }], { a: { b: "x" }, c: [] }].map(plain);""",
         ["1234.6", "123457", "–", "–", "true", "[1, a 2]", "a {b x} · c []"]),
@@ -93,8 +75,7 @@ columns = Script(
     """,
 )
 PLOTS = '["plots", 92, 146, { wide: true }]'
-STATE, MAP, SCRIPTS, LIGHTS = '["state", 68]', '["map", 108]', '["scripts", 58]', '["lights", 56, 81]'
-USUAL = f"STAGE, DRIVE, {SCRIPTS}, {STATE}, {MAP}, {PLOTS}, {LIGHTS}, END"
+STATE, MAP = '["state", 68]', '["map", 108]'
 
 # fmt: off
 COLUMNS: Rows = {
@@ -102,18 +83,6 @@ COLUMNS: Rows = {
         f"result = at(2, [STAGE, DRIVE, {STATE}, {MAP}, END]);", {"state": [165, 1, 1], "map": [164, 0, 1]}),
     "what is wide spans columns that would stay empty": (
         f"result = at(3, [STAGE, DRIVE, {STATE}, {PLOTS}, END]);", {"state": [165, 2, 1], "plots": [164, 0, 2]}),
-    "and only then": (
-        f"result = at(3, [STAGE, DRIVE, {STATE}, {MAP}, {PLOTS}, END]);",
-        {"state": [165, 2, 1], "map": [164, 0, 1], "plots": [164, 1, 1]}),
-    "tops rise along the list": (
-        f"result = ((tops) => tops.every((top, n) => !n || top >= tops[n - 1] - 6))"
-        f"(Object.values(at(3, [{USUAL}])).map(([top]) => top));", True),
-    "one column has them one after another": (
-        f"result = at(1, [{STATE}, {MAP}, {PLOTS}, END], false);",
-        {"state": [0, 0, 1], "map": [68, 0, 1], "plots": [176, 0, 1]}),
-    "what is wide leaves the last column to driving": (
-        f"result = at(3, [STAGE, DRIVE, {STATE}, {PLOTS}, END], true, {{ state: [[0, 1]] }});",
-        {"state": [164, 0, 1], "plots": [164, 1, 1]}),
     "a card keeps its column, and what is below it moves": (
         f"result = at(2, [STAGE, DRIVE, {STATE.replace('68', '200')}, {MAP}, END], true,"
         "{ state: [[0, 1]], map: [[0, 1]] });", {"state": [164, 0, 1], "map": [364, 0, 1]}),
@@ -136,20 +105,16 @@ book = Script({"core/logs.js": "LogBook, MOST"}, _BOOK, "result ??= texts();")
 
 # fmt: off
 BOOK: Rows = {
+    "gaps are seen through every filter":
+        ("take(1, 'a'); take(3, 'b'); result = texts({ search: 'nothing' });", ["… 1 line was dropped"]),
     "lines are taken once": (
         "take(1, 'a', 'b'); take(2, 'b', 'c'); take(1, 'a'); result = [texts(), book.cut];", [["a", "b", "c"], False]),
     "missing numbers are shown": (
         "take(4, 'a'); take(6, 'b'); take(19, 'c');",
         ["a", "… 1 line was dropped", "b", "… 12 lines were dropped", "c"]),
-    "another origin may have other lines": (
-        "take(1, 'a'); book.take({ origin: 'b', first: 3, lines: [{ message: 'z' }] });",
-        ["a", "… lines may be missing here", "z"]),
-    "gaps are seen through every filter":
-        ("take(1, 'a'); take(3, 'b'); result = texts({ search: 'nothing' });", ["… 1 line was dropped"]),
     "the newest 500 lines are there": (
         "for (let i = 1; i <= 700; i++) take(i, `${i}`); result = [texts().length, texts()[0], book.cut, MOST];",
         [500, "201", True, 500]),
-    "a cleared list shows what comes later": ("take(1, 'a'); book.clear(); take(1, 'a', 'b');", ["b"]),
     "lines are filtered by level service and text": ("""
         take(1, { level: "DEBUG", service: "imu", message: "d" },
              { level: "INFO", service: "bridge", message: "Hello" },
@@ -171,11 +136,9 @@ lacks = Script({"ui/cards/system.js": "lacks"})
 LACKS: list[tuple[str, Any, str]] = [
     ("reboot", None, ""),
     ("reboot", {}, NOT_OFFERED),
-    ("reboot", {"reboot": False}, NOT_OFFERED),
     ("reboot", {"system": {"reboot": {"available": True, "controls": True}}}, ""),
     ("reboot", {"system": {"reboot": {"available": True, "controls": False}}}, NO_COMMAND),
     ("reboot", {"system": {"reboot": {"available": False, "controls": False}}}, NOT_OFFERED),
-    ("reboot", {"reboot": {"controls": False}}, NO_COMMAND),
     ("git-pull", {"system": {"git_pull": {"controls": False}}}, NO_COMMAND),
 ]
 LACKING: Rows = {
@@ -206,24 +169,18 @@ DRIVEABLE = {
     "it comes back": ("YES NO YES", ["a can be driven again"]),
     "not known in between": ("YES UNKNOWN NO UNKNOWN yes", ["a can be driven again"]),
     "it was lost all the time": ("NO NO YES", []),
-    "not driven": ("yes no yes", []),
     "taken when it is lost": ("yes no NO YES", []),
-    "driven later": ("yes YES NO", [UNPLUGGED]),
 }
 # fmt: off
 NOTICES: Rows = {
-    "only changes are listed":
-        ("online('a', true, true, null, true); online('b', false, false); online('c', null, true);", []),
+    "a contact of its charger that flaps is no charge": (
+        "for (const charging of [false, true, true, false, true, false, false]) level([12, charging], [11, charging]);"
+        "result = notices.fresh.length;", 1),
     "changes are listed":
         ("online('a', true, false); online('b', false, true);", ["b is online again", "a is offline"]),
     "of each robot the newest is listed": ("""
         for (let i = 0; i < 25; i++) online('a', true, false); online('b', true, false);
         result = [texts(), notices.unread, notices.list[1].at];""", [["b is offline", "a is offline"], 2, 500]),
-    "the list is bounded and can be read": ("""
-        for (let i = 0; i < 80; i++) online(`r${i}`, true, false);
-        result = [notices.list.length, texts()[0], notices.unread, notices.fresh.length];
-        notices.read(); online('z', true, false); result.push(notices.unread, notices.fresh.length);""",
-        [50, "r79 is offline", 50, 50, 1, 1]),
     "stops are read aloud first, then the others as they came": ("""
         for (const name of ["a", "b", "c"]) online(name, true, false);
         for (const name of ["s", "a"]) for (const latched of [false, true]) see(name, "stop", { latched, by: "x" });
@@ -234,21 +191,11 @@ NOTICES: Rows = {
         see("b", "stop", { latched: true, by: "eve on phone" }); see("b", "stop", { latched: true, by: "bob" });
         see("c", "stop", { latched: false }); see("c", "stop", { latched: true });""",
         ["c was stopped by an unknown sender", "b was stopped by eve on phone"]),
-    "a script that fails": ("""
-        see("a", "script", { error: "old" }); see("a", "script", { running: true, file: "follow", error: null });
-        see("a", "script", { running: false, error: { code: 1, toString: 1 } });
-        see("b", "script", { running: true });
-        see("b", "script", { running: false, error: "emergency stop", stopped: true });""",
-        ['a script failed: {"code":1,"toString":1}']),
     "a battery that hovers around the limit is listed once, and again once it was charged": ("""
         level([50], [19.5], [20.5], [18]); result = [...texts(), notices.fresh.length];
         level([30], [12], [21], [19], [21], [19]); result.push(notices.fresh.length);
         level(...Array(5).fill([30, true]), [12], [11]); level([90], [12], [11]); level([30], [12, true], [null]);
         result.push(notices.fresh.length);""", ["a has a low battery: 18 %", 1, 1, 3]),
-    "a contact of its charger that flaps is no charge": (
-        "for (const charging of [false, true, true, false, true, false, false]) level([12, charging], [11, charging]);"
-        "result = notices.fresh.length;", 1),
-    "one reading of a battery is no event": ("level([80], [0], [80], [19], [26], [19], [80], [0]);", []),
     "a service that ends again and again": ("""
         const services = (state, restarts, last_exit) => see("a", "service", { imu: { state, restarts, last_exit } });
         const nine = "signal 9";

@@ -24,7 +24,6 @@ run = Script(_MODULES, _PREPARED)
 NUMBERS = {
     "{ value: 7.9, unit: 'v', t: 5 }": {"value": 7.9},
     "{ value: { a: 1, b: { c: 2, d: { e: 3, f: { g: 4 } } } } }": {"a": 1, "b.c": 2, "b.d.e": 3},
-    "{ t: 1, seq: 2, speed: 3 }": {"speed": 3},
     "{ value: [1, 'x', 2] }": {"0": 1, "2": 2},
     **dict.fromkeys(("{ value: null }", "{ value: Infinity }", "'7'"), None),
     "{ value: { ['x'.repeat(61)]: 1 } }": None,
@@ -34,8 +33,6 @@ NUMBERS = {
 PLACES = {
     "{ value: { x_mm: 1500, y_mm: -500, heading_rad: 0.5 }, unit: 'mm' }": [1.5, -0.5, 0.5],
     "{ value: { x: 1.5, y: -0.5, theta_rad: 0.5 }, unit: 'M' }": [1.5, -0.5, 0.5],
-    "{ value: { x: 150, y: -50, yaw_rad: 0.5, unit: 'cm' } }": [1.5, -0.5, 0.5],
-    "{ x_m: 1.5, y_m: -0.5, z_m: 0, yaw_rad: 0.5 }": [1.5, -0.5, 0.5],
     "{ value: { x_mm: 0, y_mm: 0, heading_deg: 180 } }": [0, 0, 3.14159],
     "{ value: { x: 1500, y: 0 }, unit: { toString: 0 } }": [1.5, 0, 0],
 }
@@ -54,19 +51,21 @@ TRAILS = {
 }
 # fmt: off
 RUN: Rows = {
-    "a value that is sent again is no new one": (
-        "one.push(1000, 1); one.push(990, 1); one.push(2700, 1); result = shown(one);", [[1000, 1], [2700, 1]]),
     "it is bounded in number and time": ("""
         for (let at = 0; at < 20_000; at++) one.push(at, at);
         const count = one.times.length;
         for (let at = 1; at < 400; at++) one.push(20_000 + at * 1000, at);
         result = [count, one.times.length <= 183, one.times.at(-1) - one.times[0] < 183_000];""",
         [pytest.approx(1000, abs=63), True, True]),
+    "a component at rest leaves few poses": ("""
+        const path = new core.Series(trail.poseOf, { spanMs: 3_600_000, most: 4000, differs: trail.differs });
+        for (let at = 0; at < 100_000; at += 50) path.push(at, { value: { x_mm: 1, y_mm: 0 } });
+        result = [path.times.length, trail.pieces(path.times, path.rows).length];""", [100, 1]),
+    "a value that is sent again is no new one": (
+        "one.push(1000, 1); one.push(990, 1); one.push(2700, 1); result = shown(one);", [[1000, 1], [2700, 1]]),
     "what is cleared does not come back": ("""
         one.push(1000, 1); one.push(2000, 2); one.clear(2500); one.push(3000, 3);
         result = shown(one);""", [[3000, 3]]),
-    "a slow metric has longer gaps":
-        ("for (let at = 0; at < 60_000; at += 5000) one.push(at, 1); result = one.gapMs;", 17_500),
     "gaps are gaps": ("""
         for (const at of [0, 500, 1000, 1500, 6000, 6500]) one.push(at, at);
         result = [one.columns(["value"], 600, 6400), one.gapMs];""",
@@ -74,25 +73,8 @@ RUN: Rows = {
     "a line ends where a payload lacks it": ("""
         one.push(0, { value: { a: 1, b: 2 } }); one.push(100, { value: { a: 3, b: "x" } });
         result = one.columns(["a", "b"], 0, 1000);""", [[0, 100], [1, 3], [2, None]]),
-    "a payload of a thousand numbers is cut": ("""
-        const value = Object.fromEntries(Array.from({ length: 1000 }, (_, i) => [`n${i}`, i]));
-        result = [{ value }, Array(1000).fill(1)].map((one) => Object.keys(core.numbers(one)).length);""", [24, 8]),
-    "the plots of all numbers of a metric": ("""
-        const payload = { value: { temp_c: 31, gyro: { x: 1, y: 2, z: 3 }, text: "x" } };
-        result = plots.plotsOf("sensors/imu", payload).map(({ title, fields }) => [title, fields.join()]);""",
-        [["sensors/imu temp_c", "temp_c"], ["sensors/imu gyro", "gyro.x,gyro.y,gyro.z"]]),
-    "of a battery ten minutes are plotted, and two of the rest": (
-        'result = ["charging-level", "link"].map((metric) => plots.limitsOf(metric).shownMs / 60_000);', [10, 2]),
-    "a component at rest leaves few poses": ("""
-        const path = new core.Series(trail.poseOf, { spanMs: 3_600_000, most: 4000, differs: trail.differs });
-        for (let at = 0; at < 100_000; at += 50) path.push(at, { value: { x_mm: 1, y_mm: 0 } });
-        result = [path.times.length, trail.pieces(path.times, path.rows).length];""", [100, 1]),
     **{f"the numbers of {payload}": (f"result = core.numbers({payload});", found)
         for payload, found in NUMBERS.items()},
-    **{f"the range of {low} to {high} has room": (
-        f"result = plots.spread({low}, {high}, {least});", pytest.approx(seen)) for low, high, least, seen in (
-        ("7.9", "7.9", "0.2", [7.8, 8.0]), ("0", "100", "20", [-8, 108]),
-        ("5", "5.1", "undefined", [4.992, 5.108]), ("null", "null", "1", [0, 1]))},
     **{f"the pose of {payload}": (
         f"const pose = trail.poseOf({payload}); result = [pose.x, pose.y, pose.heading];", pytest.approx(at, abs=1e-4))
         for payload, at in PLACES.items()},
@@ -115,32 +97,6 @@ const calls = [];
 store = Script({"core/store.js": "Store"}, _STORE)
 # fmt: off
 STORE: Rows = {
-    "a value ages from its age at the server": (
-        'store.set("a", "m", 7, 400); now += 100; const v = store.get("a", "m"); result = [v.value, v.age];',
-        [7, 500]),
-    "subscribers of a metric are called once for many changes": ("""
-        store.subscribe("a", "m", () => calls.push("m"));
-        store.subscribe("b", "m", () => calls.push("b"));
-        store.set("a", "m", 1); store.set("a", "m", 2); store.set("a", "n", 1); frame();
-        const first = [...calls]; store.set("a", "m", 3); frame();
-        result = [first, calls];""", [["m"], ["m", "m"]]),
-    "a metric of any component is noticed, also that it goes": ("""
-        store.subscribe(null, "m", () => calls.push(store.refs().join()));
-        store.set("a", "m", 1); store.set("b", "m", 1); frame();
-        store.set("a", "n", 1); frame();
-        store.drop("b", "m"); frame();
-        store.remove("a"); frame();
-        result = calls;""", ["a,b", "a,b", "b"]),
-    "a subscriber that fails keeps no other from being called": ("""
-        process.on("uncaughtException", (error) => calls.push(error.message));
-        store.subscribe("a", "m", () => { throw new Error("bad"); });
-        store.subscribe("b", "m", () => calls.push("b"));
-        store.set("a", "m", 1); store.set("b", "m", 2); frame();
-        await new Promise((done) => setTimeout(done, 1));
-        result = calls;""", ["b", "bad"]),
-    "a subscription ends": ("""
-        const end = store.subscribe("a", "m", () => calls.push("m"));
-        end(); store.set("a", "m", 1); frame(); result = calls;""", []),
     "components and new metrics are noticed": ("""
         store.subscribe(null, null, () => calls.push(store.refs().join()));
         store.subscribe("a", null, () => calls.push(store.metrics("a").join(" ")));
@@ -155,6 +111,23 @@ STORE: Rows = {
           now += wait; store.set("a", "m", 1); periods.push(store.get("a", "m").period);
         }
         result = periods;""", [0, 0, 0, 200, 210, 200]),
+    "a value ages from its age at the server": (
+        'store.set("a", "m", 7, 400); now += 100; const v = store.get("a", "m"); result = [v.value, v.age];',
+        [7, 500]),
+    "a metric of any component is noticed, also that it goes": ("""
+        store.subscribe(null, "m", () => calls.push(store.refs().join()));
+        store.set("a", "m", 1); store.set("b", "m", 1); frame();
+        store.set("a", "n", 1); frame();
+        store.drop("b", "m"); frame();
+        store.remove("a"); frame();
+        result = calls;""", ["a,b", "a,b", "b"]),
+    "a subscriber that fails keeps no other from being called": ("""
+        process.on("uncaughtException", (error) => calls.push(error.message));
+        store.subscribe("a", "m", () => { throw new Error("bad"); });
+        store.subscribe("b", "m", () => calls.push("b"));
+        store.set("a", "m", 1); store.set("b", "m", 2); frame();
+        await new Promise((done) => setTimeout(done, 1));
+        result = calls;""", ["b", "bad"]),
     "late messages do not set the clock back": ("""
         store.sync(50_000, 20); const prompt = store.now();
         now += 500; store.sync(50_500 - 300, 20); const late = store.now();
@@ -202,6 +175,9 @@ timeline = Script(
 )
 # fmt: off
 PLAYED: Rows = {
+    "it may only seek, play and change the speed": ("""
+        opened(); feed.seek(1); feed.play(true); [0.25, 3, 8].forEach((speed) => feed.setSpeed(speed));
+        return it.sent.map((op) => op.speed ?? op.op);""", ["seek", "play", 0.25, 8]),
     "the first seek opens the socket there, and what follows goes on from it": ("""
         opened(); return [it.sockets[0].path, it.begun, feed.position, feed.seeking, feed.seeks];""",
         ["ws/replay?robot=a%2Fb%2Fc&at=5000", 1, 5000, False, 1]),
@@ -222,27 +198,13 @@ PLAYED: Rows = {
     "pictures for the decoder are not shown, and sound is sound": ("""
         opened(); medium(0, 1); medium(1, 2); medium(2, 3); return it.media;""",
         [[[7, 255], 1, False], [[7, 255], 2, True], [7, 255]]),
-    "a stretch that was left out is shown for a while": ("""
-        opened(); played(9000, { skipped: [6000, 9000] }); const { since, until } = feed.skipped; it.now = 5000;
-        played(9100); const still = Boolean(feed.skipped); it.now = 7000; played(9200);
-        return [since, until, still, feed.skipped];""", [6000, 9000, True, None]),
     "a lost socket is made anew where it was, as it was": ("""
         globalThis.setTimeout = (fn) => { it.later = fn; };
         opened(); played(6000, { on: true, speed: 2 }); it.sockets[0].onclose(); it.later(); it.sockets[1].onopen();
         return [it.sockets[1].path, it.sent];""",
         ["ws/replay?robot=a%2Fb%2Fc&at=6000", [{"op": "speed", "speed": 2}, {"op": "play", "on": True}]]),
-    "what the server refuses is not asked again": ("""
-        globalThis.setTimeout = () => { throw new Error("again"); };
-        opened(); hear({ op: "bye", why: "too many", again: false }); it.sockets[0].onclose(); return feed.problem;""",
-        "too many"),
-    "it may only seek, play and change the speed": ("""
-        opened(); feed.seek(1); feed.play(true); [0.25, 3, 8].forEach((speed) => feed.setSpeed(speed));
-        return it.sent.map((op) => op.speed ?? op.op);""", ["seek", "play", 0.25, 8]),
 }
 TIMELINE: Rows = {
-    "a day is seen from its first to its last message": ("""
-        result = [steps(extentOf(day([0, 0, 1, 0, 32]), "2026-11-22")), steps(extentOf(day([]), "2026-11-22"))];""",
-        [[2, 5], [0, 8640]]),
     "what happened is in stretches, and only what is seen": ("""
         const all = day([2, 2, 0, 2, 64, 2, 0, 0, 2]), seen = (since, until) => ({ since: start + since, until: start +
           until });
@@ -258,9 +220,6 @@ TIMELINE: Rows = {
           first([1, 65, 1, 1, 1, 1, 65, 65], true), first([1, 1, 1, 1, 1, 1, 1, 65]), first([64, 1, 64, 64, 1]),
           firstOf({ timeline: null, name: "2026-11-22" }) - start];""",
         [3, 1.5, 6, 7, 7.5, 3, 0]),
-    "a gap has the reason that the recorder wrote down": ("""
-        const gaps = [{ since: 5, until: 9, why: "disk" }];
-        result = [whyOf(gaps, { since: 8, until: 20 }), whyOf(gaps, { since: 9, until: 20 })];""", ["disk", ""]),
     **{f"with marks at {since} and {until} is exported at {at}": (f"""
         const stretch = stretchOf({since}, {until}, [{{ since: 100, until: 200 }}], {at});
         result = [stretch.since, stretch.until];""", expected)

@@ -193,42 +193,6 @@ def test_the_socket_has_the_name_of_the_person_and_a_page_that_stood_still_learn
     ]  # fmt: skip
 
 
-def test_the_lead_at_the_loudspeaker_grows_when_the_worker_is_late_and_shrinks_afterwards() -> None:
-    """Packets come evenly; the worker stands still twice, then for a minute it does not."""
-    steps = """let now = 0;
-    performance.now = () => now;
-    const RATE = 16_000;
-    const port = { waiting: 0, postMessage({ left }) { this.waiting += left.length; } };
-    const playout = new Playout(port, RATE);
-    let played = 0;
-    let removed = 0;
-    let sequence = 0;
-    const run = (seconds, works = true) => {
-      for (const end = now + 1000 * seconds; now < end; now += 4) {
-        const pulled = Math.min(64, port.waiting);
-        port.waiting -= pulled;
-        removed += pulled;
-        played += 64;
-        if (now % 20 === 0) {
-          const samples = new Int16Array(320);
-          const sound = { samples, rate: RATE, channels: 1, encoding: "pcm", sequence: ++sequence, capturedMs: now };
-          playout.buffer.put(sound, playout.now());
-        }
-        if (works && now % 8 === 0) port.onmessage({ data: { played, removed } });
-      }
-      return Math.round(1000 * playout.lead);
-    };
-    result = [run(5)];
-    for (let i = 0; i < 2; i++) {
-      run(0.1, false);
-      run(1);
-    }
-    result.push(run(0), run(60));
-    now += 5000;  // the loudspeaker has stopped, and so does its clock
-    result.push(Math.round(1000 * (playout.now() - playout.played / RATE)));"""
-    assert evaluate({"media/playout.js": "Playout"}, steps) == [20, 40, 20, 100]
-
-
 # -- packets, buffer and resampler do exactly what those of pebble.extensions.media do, on the same packets
 
 _UNPACK = """

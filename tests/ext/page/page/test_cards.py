@@ -5,26 +5,20 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import cv2
-import numpy as np
 import pytest
 from playwright.sync_api import Locator
 
-from tests.ext.page.browser import Tab, answer
+from tests.ext.page.browser import Tab
 from tests.ext.page.canned import CannedServer, Show, State
 from tests.ext.page.states import (
-    ASKED,
     FRED,
     GOOB,
     GOOB_PATH,
     MAY_TAKE,
-    MINE,
     STATES,
     at,
     changed,
-    devices,
     of,
-    outlet,
     setting,
 )
 
@@ -116,51 +110,6 @@ def test_a_control_sends_what_it_is_for(show: Show, server: CannedServer, name: 
         assert opened.complaints() == []
 
 
-def test_a_form_is_sent_once_the_browser_finds_no_mistake_and_what_it_refuses_is_in_sight(
-    show: Show, server: CannedServer
-) -> None:
-    def refuses(name: str) -> bool:
-        opened.test("start-script").click()
-        return bool(opened.page.evaluate("document.activeElement.dataset.test") == f"set-{name}")
-
-    fields = [
-        setting("tag", "Tag", "int", required=True, min=0, max=34),
-        setting("speed", "Speed", "float", 0.5, min=0, max=1),
-    ]
-    scripts = at(GOOB, "autonomy-files", {"files": [{"file": "follow", "main": ["tag"], "configs": fields}]})
-    with show(replace(STATES["asked"], values=changed(ASKED, MINE, scripts))) as opened:
-        do(opened, "script-follow")
-        assert refuses("tag")  # it is required
-        do(opened, "set-tag=7")
-        do(opened, "more-settings")
-        do(opened, "set-speed=-5")
-        opened.page.evaluate("document.querySelector('.script-more').open = false")
-        assert refuses("speed")
-        do(opened, "restore-speed")
-        assert opened.test("set-speed").input_value() == "0.5"
-        assert server.sent("autonomy") == []
-
-
-def test_what_was_asked_is_shown_until_the_outlet_reports_anything_new(show: Show, server: CannedServer) -> None:
-    metric, report = "outlets/o2/status", outlet("o2")
-    state = replace(STATES["devices"], values=changed(devices, lambda _now: (GOOB, metric, report, 0.0)))
-    with show(replace(state, repeated={metric: 0.1})) as opened:
-        do(opened, "outlet-o2")
-        assert opened.test("outlet-asked-o2").inner_text() == "asked: on"
-        assert opened.test("outlet-o2").get_attribute("aria-checked") == "false"
-        assert opened.until(lambda: opened.test("outlet-asked-o2").inner_text() == "asked: on, not confirmed")
-        report["value"]["on"] = True
-        assert opened.until(lambda: opened.test("outlet-o2").get_attribute("aria-checked") == "true")
-        assert opened.test("outlet-asked-o2").count() == 0
-        report["value"]["on"] = None
-        assert opened.until(lambda: opened.test("outlet-state-o2").inner_text() == "unknown")
-        do(opened, "outlet-o2")
-        assert opened.test("outlet-asked-o2").inner_text() == "asked: on"
-        report["value"]["on"] = False  # another operator was faster
-        assert opened.until(lambda: opened.test("outlet-asked-o2").count() == 0)
-        assert [one["on"] for one in server.sent("outlet")] == [True, True]
-
-
 def test_stops_are_read_aloud_whatever_comes_right_after_them(show: Show) -> None:
     with show(STATES["fleet"]) as opened:
         opened.test("bell").wait_for()
@@ -200,19 +149,6 @@ def names(cards: Locator) -> list[str]:
     return cards.locator("h2").all_inner_texts()
 
 
-def test_the_first_steps_are_ticked_and_can_be_hidden(show: Show) -> None:
-    with show(STATES["fleet"]) as opened:
-        steps = opened.test("first-time")
-        steps.wait_for()
-        assert steps.locator(".step.done").count() == 0
-        opened.page.evaluate("pebble.settings.begin('drive')")
-        assert opened.until(lambda: steps.locator(".step.done").count() == 1)
-        opened.test("hide-first-time").click()
-        opened.page.reload()
-        opened.test("card-goob").wait_for()
-        assert steps.count() == 0
-
-
 def test_of_a_thousand_those_on_the_screen_are_drawn_and_each_is_found(show: Show) -> None:
     with show(STATES["fleet-thousand"]) as opened:
         cards = opened.page.locator(".fleet-card")
@@ -247,28 +183,6 @@ def test_a_stop_of_all_shows_how_many_have_confirmed_it(show: Show) -> None:
             opened.page.evaluate(confirm, number)
             assert opened.until(lambda: opened.test("tally").inner_text() == f"STOP ALL: {words}")  # noqa: B023
         assert opened.page.locator(".stops .banner").count() <= 51  # one resets all
-
-
-# -- the code that phones scan
-
-
-def test_the_code_has_the_address_of_this_screen_and_none_that_no_phone_can_open(
-    show: Show, server: CannedServer
-) -> None:
-    with show(STATES["fleet"]) as opened:
-        opened.test("fleet-more").click()
-        opened.test("phone").click()
-        opened.test("only-here").wait_for()
-        assert opened.page.locator(".qr").count() == 0
-    module = server.static.files["core/browser-more.js"].decode()
-    anywhere = answer(module.replace("isLoopback =", "isLoopback = () => false, _isLoopback ="))
-    with show(STATES["driving"], theme="dark", routes={"**/core/browser-more.js": anywhere}) as opened:
-        do(opened, "settings")
-        do(opened, "open-phone")
-        picture = cv2.imdecode(np.frombuffer(opened.page.locator(".qr").screenshot(), np.uint8), cv2.IMREAD_COLOR)
-        assert picture is not None
-        assert cv2.QRCodeDetector().detectAndDecode(picture)[0] == server.url + GOOB_PATH
-        assert opened.complaints() == []
 
 
 # -- robots that write anything

@@ -1,9 +1,8 @@
-"""Plots, what is drawn over pictures, snapshots, and a robot's own stream; in Chromium."""
+"""What is drawn over pictures, full screen, and a robot's own stream; in Chromium."""
 
 from __future__ import annotations
 
 import io
-import time
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from PIL import Image
 
 from tests.ext.page.browser import Size
 from tests.ext.page.canned import CannedServer, Show
-from tests.ext.page.states import SENSORS, STATES
+from tests.ext.page.states import STATES
 
 pytestmark = pytest.mark.page
 HERE = "!!window.pebble?.connection.you"
@@ -26,19 +25,6 @@ def seen(place: Any) -> Any:
 def like(pixels: Any, colour: tuple[int, ...]) -> Any:
     """Return which pixels have this colour."""
     return np.abs(pixels - np.array(colour)).sum(axis=2) < 60
-
-
-def test_a_plot_is_drawn_up_to_now_whatever_the_language_is_called(show: Show) -> None:
-    """No browser knows the name of this language."""
-    named = "Object.defineProperty(Navigator.prototype, 'language', { get: () => 'en-US@posix' })"
-    with show(SENSORS, script=named) as opened:
-        canvas = opened.test("plot-battery").locator("canvas")
-        colour = canvas.evaluate("(canvas) => getComputedStyle(canvas).getPropertyValue('--line-0').trim()")
-        ink = tuple(int(colour[at : at + 2], 16) for at in (1, 3, 5))
-        assert opened.until(lambda: np.array_split(like(seen(canvas), ink), 5, axis=1)[-1].sum() > 5)
-        text = opened.test("plot-battery").locator("li").inner_text()
-        assert " ".join(text.split()) == "battery 7.92 V"
-        assert opened.complaints() == []
 
 
 # -- over the picture
@@ -101,19 +87,6 @@ def test_stop_and_the_reason_remain_in_full_screen_and_overlays_can_be_off(show:
         opened.test("gear").click()
         opened.test("overlays").click()
         assert opened.until("!document.querySelector('[data-test=overlays-canvas]')")
-
-
-def test_a_snapshot_is_what_is_on_the_canvas_under_its_time(show: Show) -> None:
-    with show(STATES["driving"]) as opened:
-        with opened.page.expect_download() as saved:
-            opened.test("snapshot").click()
-        name = saved.value.suggested_filename
-        picture = Image.open(saved.value.path())
-        assert (picture.format, picture.size) == ("PNG", (640, 360))
-        assert np.asarray(picture.convert("RGB")).std() > 10
-        taken = time.mktime(time.strptime(name, "goob-%Y-%m-%dT%H-%M-%S.png"))
-        assert abs(time.time() - taken) < 10
-        assert opened.complaints() == []
 
 
 def test_a_robots_own_stream_is_shown_in_a_frame_and_never_called_live(show: Show, server: CannedServer) -> None:

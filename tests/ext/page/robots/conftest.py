@@ -1,4 +1,4 @@
-"""What all modules here share: one browser, and robots on microcontrollers, which are ready within two seconds."""
+"""What all modules here share: robots on microcontrollers, which are ready within two seconds."""
 
 from __future__ import annotations
 
@@ -7,15 +7,9 @@ from collections.abc import Iterator
 import pytest
 from playwright.sync_api import Browser
 
-from tests.ext.page.browser import chromium
-from tests.ext.page.console import Console, Wire, console, used
+from tests.ext.page.attacker import Everything
+from tests.ext.page.console import Console, console, used
 from tests.ext.page.stage import Stage
-
-
-@pytest.fixture(scope="package")
-def browser() -> Iterator[Browser]:
-    with chromium() as running:
-        yield running
 
 
 @pytest.fixture(scope="package")
@@ -25,8 +19,8 @@ def stage() -> Iterator[Stage]:
 
 
 @pytest.fixture(scope="module")
-def wire(stage: Stage) -> Iterator[Wire]:
-    running = Wire(stage)
+def wire(stage: Stage) -> Iterator[Everything]:
+    running = Everything(stage.broker_port)
     yield running
     running.close()
 

@@ -7,29 +7,20 @@ from collections.abc import Callable
 import pytest
 from playwright.sync_api import Browser, Locator
 
+from tests.ext.page.attacker import Everything
 from tests.ext.page.browser import tab
 from tests.ext.page.canned import CannedServer
-from tests.ext.page.console import KEYS, Console, Wire, console
+from tests.ext.page.console import Console, console
 from tests.ext.page.stage import Stage
 from tests.ext.page.states import STATES
 
 pytestmark = pytest.mark.alone  # deadlines are checked
 
 
-# -- keys
-
-
-def test_each_key_turns_the_wheels_while_it_is_held(at_lamp: Console) -> None:
-    for key, wheels in KEYS.items():
-        assert at_lamp.drive(key, wheels=wheels), (key, at_lamp.wheels, at_lamp.reason)
-        at_lamp.let_go()
-        assert at_lamp.rests(), key
-
-
 # -- stops
 
 
-def test_the_space_bar_ends_the_gesture_and_latches_nothing(at_lamp: Console, wire: Wire) -> None:
+def test_the_space_bar_ends_the_gesture_and_latches_nothing(at_lamp: Console, wire: Everything) -> None:
     assert at_lamp.drive()
     at_lamp.page.keyboard.press("Space")
     assert at_lamp.rests()
@@ -63,7 +54,7 @@ STOPS: dict[str, Callable[[Console], None]] = {
 
 
 @pytest.mark.parametrize("how", STOPS)
-def test_a_stop_latches_the_robot_which_stays_at_rest(at_lamp: Console, wire: Wire, how: str) -> None:
+def test_a_stop_latches_the_robot_which_stays_at_rest(at_lamp: Console, wire: Everything, how: str) -> None:
     assert at_lamp.drive()
     STOPS[how](at_lamp)
     assert at_lamp.tab.until(lambda: wire.latched("minilamp"))
@@ -74,7 +65,9 @@ def test_a_stop_latches_the_robot_which_stays_at_rest(at_lamp: Console, wire: Wi
     assert at_lamp.stays_at_rest()
 
 
-def test_stop_all_latches_every_robot_and_each_is_reset_by_itself(stage: Stage, at_lamp: Console, wire: Wire) -> None:
+def test_stop_all_latches_every_robot_and_each_is_reset_by_itself(
+    stage: Stage, at_lamp: Console, wire: Everything
+) -> None:
     assert at_lamp.drive()
     at_lamp.test("stop-all").click()
     assert at_lamp.tab.until(lambda: all(wire.latched(name) for name in stage.robots))
@@ -125,20 +118,6 @@ def test_a_second_tab_stops_by_the_space_bar_and_takes_over_by_a_hold(
         assert at_lamp.stays_at_rest()
         assert at_lamp.press_anew()
         assert second.tab.complaints() == []
-
-
-# -- the fleet
-
-
-def test_the_fleet_stops_robots(browser: Browser, stage: Stage, wire: Wire) -> None:
-    with tab(browser, stage.url) as fleet:
-        assert fleet.until(lambda: fleet.page.locator(".fleet-card").count() == 2)
-        fleet.test("stop-benjr").click()
-        assert fleet.until(lambda: wire.latched("benjr"))
-        assert not wire.latched("minilamp")
-        fleet.test("card-minilamp").click(position={"x": 4, "y": 4})  # the whole card is the link, but for its Stop
-        assert fleet.until("window.pebble.driver.ref === 'pebble/robots/minilamp'")
-        assert fleet.complaints() == []
 
 
 # -- without a mouse

@@ -8,12 +8,45 @@ from contextlib import contextmanager
 import pytest
 from playwright.sync_api import Browser
 
-from tests.ext.page.browser import Size, Theme
-from tests.ext.page.console import BACK, FORWARD, LEFT, RIGHT, Console, Wheels, Wire, console, used
-from tests.ext.page.fingers import Fingers
+from tests.ext.page.attacker import Everything
+from tests.ext.page.browser import Size, Tab, Theme
+from tests.ext.page.console import BACK, FORWARD, LEFT, RIGHT, Console, Wheels, console, used
 from tests.ext.page.stage import Stage
 
 pytestmark = pytest.mark.page  # deadlines are checked
+
+
+class Fingers:
+    """Fingers on the glass of one tab, by number; positions are pixels of the window."""
+
+    def __init__(self, tab: Tab) -> None:
+        self._session = tab.cdp()
+        self._places: dict[int, tuple[float, float]] = {}
+
+    def down(self, finger: int, x: float, y: float) -> None:
+        self._places[finger] = x, y
+        self._send("touchStart", *self._places)
+
+    def move(self, finger: int, x: float, y: float) -> None:
+        self._places[finger] = x, y
+        self._send("touchMove", *self._places)
+
+    def up(self, finger: int) -> None:
+        self._send("touchEnd", finger)
+        del self._places[finger]
+
+    def cancel(self) -> None:
+        """Cancels a touch as a call, a system gesture or too many fingers do."""
+        self._places.clear()
+        self._send("touchCancel")
+
+    def lift(self) -> None:
+        for finger in list(self._places):
+            self.up(finger)
+
+    def _send(self, kind: str, *fingers: int) -> None:
+        points = [{"id": one, "x": self._places[one][0], "y": self._places[one][1]} for one in fingers]
+        self._session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
 
 
 class Phone(Console):
@@ -70,7 +103,7 @@ def test_the_stick_follows_a_finger_until_it_is_lifted(
 # -- a second finger
 
 
-def test_a_second_finger_on_stop_latches(at_lamp: Phone, wire: Wire) -> None:
+def test_a_second_finger_on_stop_latches(at_lamp: Phone, wire: Everything) -> None:
     assert at_lamp.drive_by_stick()
     at_lamp.touch("stop-one")
     assert at_lamp.tab.until(lambda: wire.latched("minilamp"))

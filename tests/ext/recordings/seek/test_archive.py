@@ -45,7 +45,7 @@ def pictures(encoding: str, seconds: float) -> Iterator[Line]:
 def film(root: Path, encoding: str, seconds: float, *, finished: bool = True) -> Path:
     """A folder as a recorder leaves it: one file of state, one of media, a chunk each second."""
     day = root / "2023/11/14"
-    capabilities = js(t=ms(0), value={"video": {"available": True}})
+    capabilities = js(t=ms(0), value={"video": {"available": True}, "audio": {"available": True}})
     offered = Line(0.0, f"{GOOB}/outgoing/capabilities", capabilities, 1, retain=True)
     shown = [offered, *demo(seconds, [GOOB]), *pictures(encoding, seconds)]
     lines = sorted(shown, key=lambda line: line.at)

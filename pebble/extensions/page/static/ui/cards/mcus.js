@@ -31,16 +31,9 @@ function Mcu({ at, uid, id, whyNot }) {
   </section>`;
 }
 
-/** The newest payload of an interface, under its own topic or under its alias. */
-function useReading(at, uid, one) {
-  const own = useMetric(at, `mcu/${uid}/${one.name}`);
-  const alias = useMetric(at, one.channel ?? "");
-  return own ?? alias;
-}
-
 function Readings({ at, uid, one }) {
   useTick(1000);
-  const entry = useReading(at, uid, one);
+  const entry = useMetric(at, `mcu/${uid}/${one.name}`);
   const online = useOnline(at);
   const { age = 0, period = 0 } = entry ?? {};
   const repeats = one.kind === "sample" || one.rate_hz > 0; // others are sent when they change

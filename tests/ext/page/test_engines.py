@@ -1,4 +1,4 @@
-"""Browsers behind the same interface: Firefox by WebDriver BiDi, WebKitGTK by its WebDriver."""
+"""The page in Firefox and in WebKitGTK: one drives and stops a robot, and the keys of a stop work in every state."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import shutil
 import signal
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -19,18 +19,21 @@ from typing import Any
 import pytest
 from websockets.sync.client import ClientConnection, connect
 
-from tests.support import WAIT_S, Child, free_port, listening, until
+from tests.ext.page.served import Served
+from tests.kit.played_robot import RecordingRobot
+from tests.support import WAIT_S, Broker, Child, free_port, listening, until
+
+pytestmark = [pytest.mark.page, pytest.mark.timeout(400)]
 
 #: Keys that a character cannot name, as WebDriver has them (W3C WebDriver, 17.4.2).
 KEYS = {"Escape": "\ue00c", "Enter": "\ue007", "Control": "\ue009", "Meta": "\ue03d", "Space": " "}
 SIZE = (1280, 800)
-#: Of a Firefox that asks no other host for anything, and knows fingers.
+#: Of a Firefox that asks no other host for anything.
 QUIET = {
     "app.update.enabled": False,
     "browser.shell.checkDefaultBrowser": False,
     "browser.startup.homepage_override.mstone": "ignore",
     "datareporting.policy.dataSubmissionEnabled": False,
-    "dom.w3c_touch_events.enabled": 1,
     "network.captive-portal-service.enabled": False,
     "network.connectivity-service.enabled": False,
     "services.settings.server": "http://127.0.0.1:1",
@@ -67,8 +70,8 @@ class Engine(ABC):
         keys += [{"type": "pause", "duration": ms}, *({"type": "keyUp", "value": code} for code in reversed(codes))]
         self.perform([{"type": "key", "id": "keys", "actions": [*keys, {"type": "pause", "duration": 100}] * times}])
 
-    def click(self, selector: str, hold_ms: int = 0, pointer: str = "mouse") -> None:
-        """Press the middle of an element with the mouse or by "touch", once it is shown and rests."""
+    def click(self, selector: str, hold_ms: int = 0) -> None:
+        """Press the middle of an element with the mouse, once it is shown and rests."""
         found = f"[...document.querySelectorAll({json.dumps(selector)})].find((one) => one.getClientRects().length)"
         scrolled = f"({found}?.scrollIntoView({{ block: 'nearest' }}), {found})"
         assert self.until(scrolled), f"{self.name} shows no {selector}"
@@ -86,7 +89,7 @@ class Engine(ABC):
             {"type": "pause", "duration": hold_ms},
             {"type": "pointerUp", "button": 0},
         ]
-        self.perform([{"type": "pointer", "id": pointer, "parameters": {"pointerType": pointer}, "actions": steps}])
+        self.perform([{"type": "pointer", "id": "mouse", "actions": steps}])
 
 
 class Firefox(Engine):
@@ -94,11 +97,11 @@ class Firefox(Engine):
 
     name = "Firefox"
 
-    def __init__(self, connection: ClientConnection, width: int, height: int) -> None:
+    def __init__(self, connection: ClientConnection) -> None:
         self._connection, self._numbers = connection, itertools.count(1)
         self._send("session.new", capabilities={})
         self._context = self._send("browsingContext.create", type="tab")["context"]
-        viewport = {"width": width, "height": height}
+        viewport = dict(zip(("width", "height"), SIZE, strict=True))
         self._send("browsingContext.setViewport", context=self._context, viewport=viewport)
 
     def open(self, url: str) -> None:
@@ -171,8 +174,8 @@ class WebKit(Engine):
 
 
 @contextmanager
-def firefox(folder: Path, size: tuple[int, int] = SIZE) -> Iterator[Firefox]:
-    """A Firefox with a new profile in ``folder``, whose page has this many CSS pixels."""
+def firefox(folder: Path) -> Iterator[Firefox]:
+    """A Firefox with a new profile in ``folder``."""
     program = shutil.which("firefox-esr") or pytest.skip("no Firefox: apt install firefox-esr")
     lines = [f"user_pref({json.dumps(key)}, {json.dumps(value)});\n" for key, value in QUIET.items()]
     (folder / "user.js").write_text("".join(lines))
@@ -183,7 +186,7 @@ def firefox(folder: Path, size: tuple[int, int] = SIZE) -> Iterator[Firefox]:
         match = found()
         assert match is not None
         with connect(f"{match[1]}/session", max_size=None, open_timeout=30, ping_interval=None) as connection:
-            yield Firefox(connection, *size)
+            yield Firefox(connection)
 
 
 @contextmanager
@@ -220,3 +223,95 @@ def running(command: list[str], output: Path, env: Mapping[str, str] | None = No
         finally:
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
+
+
+_NUMBERS = itertools.count(1)
+
+
+@pytest.fixture(scope="module", params=["Firefox", "WebKitGTK"])
+def engine(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Engine]:
+    folder = tmp_path_factory.mktemp(request.param)
+    with firefox(folder) if request.param == "Firefox" else webkit(folder) as running:
+        yield running
+
+
+@pytest.fixture
+def robot(broker: Broker) -> Iterator[RecordingRobot]:
+    with RecordingRobot(broker.port, f"pebble/robots/robot{next(_NUMBERS)}", keeps=True) as running:
+        yield running
+
+
+def shown(engine: Engine, served: Served, robot: RecordingRobot) -> None:
+    """Open the robot's page."""
+    engine.open(f"{served.origin}/r/{robot.base}")
+    assert engine.until("globalThis.pebble?.connection?.isOpen && document.querySelector('[data-test=take]')")
+
+
+def test_a_person_drives_and_stops_a_robot(engine: Engine, served: Served, robot: RecordingRobot) -> None:
+    engine.open(served.origin)
+    card = f"[href$='/r/{robot.base}']"
+    assert engine.until(f"document.querySelectorAll('.fleet-card').length === 1 && document.querySelector({card!r})")
+    engine.click(card)  # the cards of earlier robots have left, and none moves
+    engine.click("[data-test=take]")
+    assert engine.until("document.querySelector('[data-test=release]')")
+    for _ in range(5):  # the first command waits until the page knows how long messages take
+        engine.press("w", ms=800)
+        if any(drive.get("z", 0) > 0 for drive in robot.drives()):
+            break
+    assert any(drive.get("z", 0) > 0 for drive in robot.drives())
+    assert until(lambda: robot.drives()[-1].get("z") == 0)
+    engine.click("[data-test=release]")
+    assert engine.until("document.querySelector('[data-test=take]')")
+    engine.click("[data-test=stop-one]")
+    assert until(lambda: robot.latched)
+    engine.click("[data-test=reset]")
+    assert engine.until("document.querySelector('[data-test=reset-hold]')")
+    engine.click("[data-test=reset-hold]", hold_ms=2000)
+    assert until(lambda: not robot.latched)
+
+
+def _full_screen(engine: Engine) -> None:
+    if engine.evaluate("Boolean(document.fullscreenElement)"):
+        return
+    full = "document.documentElement.requestFullscreen()"
+    engine.evaluate(f"void addEventListener('click', () => {full}, {{ once: true }})")
+    engine.click("h2")
+    assert engine.until("document.fullscreenElement")
+
+
+def _list(engine: Engine) -> None:
+    engine.click("[data-test=picker]")
+    time.sleep(0.5)
+
+
+def _dialog(engine: Engine) -> None:
+    engine.click("[data-test=settings]")
+    assert engine.until("document.querySelector('dialog[open]')")
+
+
+WHERE: dict[str, Callable[[Engine], object]] = {
+    "nothing": lambda _: None,
+    "full screen": _full_screen,
+    "an open list": _list,
+    "a dialog": _dialog,
+    "another window": lambda engine: engine.evaluate("void dispatchEvent(new Event('blur'))"),
+}
+CHORDS = {"Ctrl+Enter": 1, "⌘+Enter": 1, "Ctrl+Space": 1, "Escape": 2}
+
+
+@pytest.mark.parametrize(("where", "chord"), list(itertools.product(WHERE, CHORDS)))
+def test_the_keys_of_a_stop_work_and_one_escape_stops_nothing(
+    engine: Engine, served: Served, robot: RecordingRobot, where: str, chord: str
+) -> None:
+    shown(engine, served, robot)
+    WHERE[where](engine)
+    engine.press("Escape")
+    assert not until(lambda: robot.latched, 1)
+
+    def stops() -> bool:
+        """True if it stops; a busy machine may take too long between two presses of Escape."""
+        WHERE[where](engine)
+        engine.press(chord.replace("⌘", "Meta").replace("Ctrl", "Control"), CHORDS[chord])
+        return until(lambda: robot.latched, 3)
+
+    assert until(stops, 60)
