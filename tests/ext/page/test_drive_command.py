@@ -334,8 +334,11 @@ def test_a_process_that_stood_still_needs_a_new_key() -> None:
     assert cab.moves()
 
 
-def test_the_status_names_a_script_that_drives() -> None:
+def test_the_status_names_a_layout_without_latin_letters_and_a_script_that_drives() -> None:
     cab = Cab().ready()
+    cab.run(0.1, "ц")
+    assert "this keyboard types ц: W A S D need a Latin layout" in cab.driver.status()
+    assert cab.moves("up")
     cab.receive(outgoing(GOOB, "autonomy-status", {"running": True, "timestamp": 1, "file": "x", "label": "Follow"}))
     assert cab.driver.status().startswith("goob · goob drives itself: Follow · ")
 
@@ -343,7 +346,7 @@ def test_the_status_names_a_script_that_drives() -> None:
 #: What becomes of a request for control that bob has: his robot's state after it, the seconds, the status line.
 ASKED: dict[str, tuple[dict[str, Any], float, str]] = {
     "it waits": ({"asks": "ann", "asks_id": "{id}"}, 0.5, "asked bob for control · "),
-    "he gives it": ({"by": "ann", "id": "{id}", "key": "k2"}, 0.5, "ready"),
+    "he gives it": ({"by": "ann", "id": "{id}", "key": "k2"}, 0.5, "you have control, no longer bob · ready"),
     "he drives on": ({"asks": "ann", "asks_id": "{id}"}, 31, "bob drives on · "),
     "no answer": ({}, 31, "goob does not answer · "),
 }

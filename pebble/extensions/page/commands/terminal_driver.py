@@ -51,8 +51,10 @@ class TerminalDriver:
         self._gesture = 0  # the number of the newest one
         self._pressed = False  # a key is held: of this gesture, or of an ended one, which moves nothing any more
         self._reason = ""  # why the robot cannot be driven now
+        self._note = ""  # about the keyboard, for the person
         self._key_at = self._ticked_at = self._escape_at = float("-inf")
         self._out: list[Command] = []  # to be sent with the next tick
+        self._asked = ""  # the holder of control who was asked for it last
         self._failures: list[str] = []  # why the newest request for control has failed
 
     @property
@@ -88,6 +90,8 @@ class TerminalDriver:
             elif key in _AXES:
                 axis, direction = _AXES[key]
                 self._held[axis], self._key_at, self._willing = (direction, now), now, True
+            elif not key.isascii():
+                self._note = f"this keyboard types {key}: W A S D need a Latin layout; the arrows drive, too"
             if key == ESCAPE:
                 self._escape_at = now
         if len(keys) >= _BURST:  # the person may have let go of them long ago
@@ -103,6 +107,7 @@ class TerminalDriver:
         # Answered at once, as no network is between keys and driver: unanswered pings would count as a slow page.
         clock.echo(clock.ping(now), 1000 * now, now)
         view = self._driven.shown(self._tab, now)
+        self._asked = (view.by if view.asking else "") or self._asked
         may_request = self.robot.situation(now).published  # its capabilities are known
         if view.keeps:  # the robot itself decides who drives: nothing is requested before it has published who does
             may_request = self._driven.published is not None
@@ -142,6 +147,7 @@ class TerminalDriver:
         parts = (
             self.name,
             f"asked {view.by} for control" if view.asking and view.by else "",
+            f"you have control, no longer {self._asked}" if view.you and self._asked else "",
             *([] if view.you else self._failures),  # ``you``: this terminal has control
             robot.itself,  # that it drives itself, by a script
             motion,
@@ -150,6 +156,7 @@ class TerminalDriver:
             f"{view.asks} asks for control: l lets {view.asks} drive" if view.you and view.asks else "",
             "" if robot.volts is None else f"{robot.volts:.1f} V",
             "" if not robot.slow_s else f"slow connection: commands take {robot.slow_s:.1f} s",
+            self._note,
         )
         return " · ".join(filter(None, parts))
 
@@ -161,7 +168,7 @@ class TerminalDriver:
                 self.robot.assume((*AXES, "y"))
 
     def _take(self, now: float, *, over: bool) -> None:
-        self._willing, self._failures = False, []
+        self._willing, self._asked, self._failures = False, "", []
         self._out += self._driven.take(self._tab, now, lambda: None, self._failures.append, over=over)
 
     def _drive(self, now: float) -> None:
@@ -169,7 +176,7 @@ class TerminalDriver:
         x, z, y = self._wanted(now)
         moves = bool(x or z or y)
         if moves and not self._pressed:
-            self._gesture += 1
+            self._gesture, self._asked = self._gesture + 1, ""
         self._pressed = moves or (self._pressed and now - self._key_at < HELD_S)
         if moves or self._driven.state is State.MOVING:
             op = DriveOp(ref=self.robot.base, g=self._gesture, t=1000 * now, x=x, z=z, y=y)
