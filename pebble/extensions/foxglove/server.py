@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from pebble.errors import PebbleError
 from pebble.extensions.recordings.exports.foxglove_messages import MOST_CHANNELS, Schemas
+from pebble.transports.socket_holders import port_holder
 
 if TYPE_CHECKING:
     import foxglove
@@ -76,7 +77,9 @@ class Server:
             )
         except RuntimeError as error:
             why = str(error).removeprefix("FoxgloveError: Failed to bind port: ").partition(" (os error")[0]
-            raise PebbleError(f"cannot listen on {host} port {port}: {why}; choose another with --port") from None
+            raise PebbleError(
+                f"cannot listen on {host} port {port}: {why}{port_holder(port)}; choose another with --port"
+            ) from None
         shown = f"[{host}]" if ":" in host else host
         return f"ws://{shown}:{self._server.port}"
 

@@ -14,6 +14,7 @@ from pebble.extensions.operator.notices import say
 from pebble.extensions.operator.signals import ending_event
 from pebble.transports import Message, MqttSettings
 from pebble.transports.counters import bounds_reached
+from pebble.transports.socket_holders import why_not
 
 REQUEST_S: Final = 5.0  # for a request and its answer
 _MAX_REQUEST: Final = 8192  # bytes
@@ -32,7 +33,7 @@ class Exporter:
             try:
                 server = await asyncio.start_server(self._answer, host, port, limit=_MAX_REQUEST)
             except OSError as error:
-                why = error.strerror
+                why = why_not(error, port)
                 raise PebbleError(f"cannot listen on {host} port {port}: {why}; choose another with --port") from None
             await self._broker.open()
             self._broker.report(say)

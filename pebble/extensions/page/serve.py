@@ -19,6 +19,7 @@ from pebble.extensions.page.app import create_app
 from pebble.extensions.page.setting import WebSettings
 from pebble.transports.credentials import no_password
 from pebble.transports.renewed import Renewed
+from pebble.transports.socket_holders import why_not
 
 _LARGEST_MESSAGE = 64 * 1024
 _END_S = 1
@@ -144,8 +145,8 @@ def listen(settings: WebSettings) -> socket.socket:
     except OSError as error:
         listener.close()
         raise PebbleError(
-            f"cannot listen on {settings.host} port {settings.port}: {error.strerror};"
-            " choose another with --port (`sudo ss -ltnp` names who has it)"
+            f"cannot listen on {settings.host} port {settings.port}: {why_not(error, settings.port)};"
+            " choose another with --port"
         ) from None
     return listener
 

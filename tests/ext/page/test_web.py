@@ -212,7 +212,8 @@ def started(*arguments: str) -> tuple[subprocess.Popen[str], str]:
 
 def test_a_port_in_use_is_named(run: Run, broker: Broker) -> None:
     assert run("web", "--url", f"mqtt://127.0.0.1:{broker.port}", "--port", broker.port) == 1
-    assert run.err.startswith(f"pebble: cannot listen on 127.0.0.1 port {broker.port}: Address already in use; choose")
+    fact = f"Address already in use (by process {broker.pid} of user {os.getuid()}: '"
+    assert run.err.startswith(f"pebble: cannot listen on 127.0.0.1 port {broker.port}: {fact}")
 
 
 def test_it_says_when_the_broker_cannot_be_reached_and_when_it_can_again(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from pebble.transports.counters import Counters
 from pebble.transports.peers import FileLock, PeerRegistry, new_name, prepare_run_dir
 from pebble.transports.renewed import Renewed
 from pebble.transports.settings import ZenohSettings
+from pebble.transports.socket_holders import why_not
 from pebble.transports.zenoh.hub.admission import Admission
 from pebble.transports.zenoh.hub.store import HubStore
 from pebble.transports.zenoh.hub.worker import HubWorker
@@ -151,7 +152,7 @@ class ZenohHub:
         except (ValueError, OSError) as error:
             if not (isinstance(error, OSError) and error.errno == errno.EADDRINUSE):
                 return True  # Zenoh says what is wrong with it
-            fact = f"transport.listen: {endpoint}: {error.strerror} (`sudo ss -lntup` names the process)"
+            fact = f"transport.listen: {endpoint}: {why_not(error, int(port))}"
             if not self._settings.of_robot:
                 raise TransportError(f"{fact}; end it, or name another port") from None
             log.error("%s; the robot runs without it: end that process and start the robot again", fact)
