@@ -70,7 +70,7 @@ class Clips:
     def _path(self, name: str) -> Path | None:
         """Return the path that a name means, with links resolved; None if it means none."""
         try:
-            return (self._folder.resolve() / name.replace("\\", "/")).resolve()
+            return (self._folder.resolve() / _expanded(name.replace("\\", "/"))).resolve()
         except (OSError, RuntimeError, ValueError):  # links in a circle, no text of a path
             return None
 
@@ -112,3 +112,10 @@ class Clips:
             return True
         self.problem = self.problem or f"{name!r} cannot be named in commands: rename it"
         return False
+
+
+def _expanded(name: str) -> Path:
+    try:
+        return Path(name).expanduser()
+    except RuntimeError:  # no user of that name: a file whose name begins with ~
+        return Path(name)

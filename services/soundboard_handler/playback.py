@@ -35,6 +35,7 @@ class Playback:
         self.process: Child | None = None
         self.ended = self.stopped = False
         self.problem = self._decoding_problem = ""  # for operators; why the file could not be decoded to its end
+        self.exit_code = 0
         self._config, self._post = config, post
         self._on_change = partial(on_change, self)
 
@@ -98,7 +99,7 @@ class Playback:
                 self._decoding_problem = str(error)
 
     def _finished(self, code: int) -> None:
-        self.ended = True
+        self.exit_code, self.ended = code, True
         if not self.stopped:
             self.problem = f"player exited with code {code}" if code else self._decoding_problem
         self._on_change()

@@ -7,8 +7,8 @@ from typing import Any
 from msgspec import Struct
 
 from pebble.config.home import in_home
-from pebble.contract import SOUNDBOARD_COMMAND, SOUNDBOARD_FILES, SOUNDBOARD_STATUS
-from pebble.contract.payloads import STOP_WORDS, SoundboardCommand, SoundboardFiles, SoundboardStatus
+from pebble.contract import MEDIA_REPORT, SOUNDBOARD_COMMAND, SOUNDBOARD_FILES, SOUNDBOARD_STATUS
+from pebble.contract.payloads import STOP_WORDS, MediaReport, SoundboardCommand, SoundboardFiles, SoundboardStatus
 from pebble.errors import PebbleError
 from pebble.runtime.service import Service, on
 from pebble.services.soundboard_handler.clips import Clip, Clips
@@ -16,6 +16,8 @@ from pebble.services.soundboard_handler.config import SoundboardHandler as Sound
 from pebble.services.soundboard_handler.playback import Playback
 
 _PLAY = ("play", "start", "on", "enable", "enabled")
+_AT_ONCE_S = 1.0  # a player that fails so soon may not have got the device
+_REPORT_AGE_S = 3.0  # of a report that still counts; one comes every second
 _SHORTEST_S = 0.2  # between two starts of a clip that is repeated
 _SCAN_S = 10.0  # between two looks into the folder of sounds
 _KILL_S = 5.0  # before a player that does not end is killed
@@ -46,6 +48,7 @@ class SoundboardHandler(Service):
         self._started_at = 0.0  # when the newest player began to play
         self._request: _Request | None = None  # what is played now, or will be when the player has ended
         self._error: str | None = None  # in the status: why the newest command did not play
+        self._talk_back_at = -math.inf  # when audio_receiver last reported that it plays
 
     def start(self) -> None:
         self.timers.add(self.clock(), self.scan, period=_SCAN_S)
@@ -74,6 +77,12 @@ class SoundboardHandler(Service):
             self._replace(request)
         else:
             self._publish_status()
+
+    @on(MEDIA_REPORT)
+    def media_report(self, report: MediaReport, program: str) -> None:
+        """Note when talk-back used the loudspeaker."""
+        if program == "audio_receiver" and report.running and (report.doing or "").startswith("plays"):
+            self._talk_back_at = self.clock()
 
     def _requested(self, command: SoundboardCommand) -> _Request | None:
         """Return the clip to play; None, with an error in the status, if there is none."""
@@ -140,12 +149,19 @@ class SoundboardHandler(Service):
         elif not playback.problem and request is not None and request.starts < request.times:
             self.call_at(self._started_at + _SHORTEST_S, lambda: self._repeat(playback))
         else:
-            self._request, self._error = None, playback.problem or None
+            self._request, self._error = None, self._problem_of(playback)
             self._play_next()
 
     def _repeat(self, playback: Playback) -> None:
         if playback is self._playback and not playback.stopped:
             self._play_next()
+
+    def _problem_of(self, playback: Playback) -> str | None:
+        now = self.clock()
+        at_once, talk_back = now - self._started_at < _AT_ONCE_S, now - self._talk_back_at < _REPORT_AGE_S
+        if playback.exit_code != 0 and at_once and talk_back:
+            return "the loudspeaker is busy (talk-back plays)"
+        return playback.problem or None
 
     def _publish_status(self) -> None:
         playback = self._playback

@@ -14,12 +14,14 @@ from unicodedata import normalize
 import numpy as np
 import pytest
 
-from pebble.contract.payloads import SoundboardFiles
+from pebble.contract import MEDIA_REPORT, codec
+from pebble.contract.payloads import MediaReport, SoundboardFiles
 from pebble.errors import PebbleError
 from pebble.extensions.lab.simulation.loudspeaker import Playback, playbacks
 from pebble.extensions.media.pcm import Samples
 from pebble.services.soundboard_handler.clips import Clips
 from pebble.services.soundboard_handler.service import SoundboardHandler
+from pebble.transports import QoS
 from tests.ext.media.test_sound import encode
 from tests.kit.robot import Program, ProgramRobot
 from tests.support import WAIT_S, Broker, gone, until
@@ -254,6 +256,22 @@ def test_a_clip_is_repeated(board: Soundboard) -> None:
     assert until(lambda: len(board.played) >= 4)
     board.send(False)
     assert board.became(playing=False, error=None)
+
+
+@pytest.mark.parametrize(
+    ("doing", "error"),
+    [
+        ("plays 16 kHz, 1 channel", "the loudspeaker is busy (talk-back plays)"),
+        ("is silent", "player exited with code 1"),
+    ],
+)
+def test_a_loudspeaker_that_talk_back_has_is_busy(make: Make, doing: str, error: str) -> None:
+    """Its player fails at once, which one in Python does not on a busy machine."""
+    board = make(player_command=["sh", "-c", "exit 1"], clip=0.1)
+    report = codec.encode(MEDIA_REPORT, MediaReport(running=True, doing=doing))
+    board.world.transport.publish(f"{board.world.base}/outgoing/media-report/audio_receiver", report, qos=QoS.DELIVERED)
+    board.play("a.wav")
+    assert board.became(playing=False, file=None, error=error)
 
 
 def test_other_formats_are_decoded_and_played(board: Soundboard) -> None:
