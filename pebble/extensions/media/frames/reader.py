@@ -54,6 +54,7 @@ class FrameReader:
         self._count_received, self._count_shared = map(self.counters.adder, ("received", "shared"))
         self.problem = ""
         self._latest = _LatestFrames(depth)  # closed while the reader is
+        self.running: set[int] = set()  # ids of writers
         self._seen: set[int] = set()  # ids of writers that were counted
         self._newest = 0, 0  # writer and number of the newest frame that has arrived
         self._replaced = -1  # the writer before that of the newest frame
@@ -107,6 +108,7 @@ class FrameReader:
             return
         (session, declared), self._session = self._session, None
         declared.clear()
+        self.running.clear()
         close_session(session)
 
     def close(self) -> None:
@@ -130,6 +132,11 @@ class FrameReader:
     def shared(self) -> bool:
         """True if frames come through shared memory. If not, `problem` explains why, unless ``sharing`` is False."""
         return self._sharing and not self.problem
+
+    @property
+    def writers(self) -> int:
+        """Number of writers of the stream now: 0 or 1, or 2 for a moment when one replaces another."""
+        return len(self.running)
 
     def read(self, timeout: float | None = None) -> Frame | None:
         """Return the newest frame that was not returned before; with ``depth``, the oldest of those that wait.
@@ -205,18 +212,20 @@ class FrameReader:
         return info.sequence - number - 1 if info.writer == writer else 0
 
     def _on_writer(self, sample: zenoh.Sample) -> None:
-        """Note that a writer begins; let the session be reopened to begin or to stop sharing memory with it."""
+        """Note that a writer begins or ends; let the session be reopened to begin or to stop sharing memory with it."""
         try:
             writer_id, size, segment = self._names.writer_of(str(sample.key_expr))
         except ValueError:
             self.counters.add("refused")
             return
         if sample.kind != zenoh.SampleKind.PUT:
+            self.running.discard(writer_id)
             return
         new = writer_id not in self._seen
         if new:
             self._seen.add(writer_id)
             self.counters.add("writers")
+        self.running.add(writer_id)
         if new and size and self._lacked_room:  # this writer shares memory, so it has found room: so may the reader
             self._lacked_room = False
             self._reopen_soon("")
