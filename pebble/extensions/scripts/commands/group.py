@@ -2,6 +2,7 @@
 
 import re
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.resources import files
@@ -35,6 +36,7 @@ _HELP = """Programs that move a robot by themselves; docs/ext/scripts.md explain
 """
 _is_name = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,62}").fullmatch
 _FIRST_SECOND_S = 1.0  # most mistakes in a script end it within that
+_SAME_ERROR_S = 1.0  # an error that was there before the command is the answer to it, too, if it stays
 
 
 def new(
@@ -112,13 +114,12 @@ def start(
             file = meant(scripts.files or (), file)
         except PebbleError as error:
             raise PebbleError(f"{shown(file)}: {error}") from None
-        before, answers_before = scripts.status, scripts.answers
+        before, answers_before, began = scripts.status, scripts.answers, time.monotonic()
         _require_sent(transport, scripts.start(transport, file, context.args))
 
         def is_answered() -> bool:
-            if scripts.answers == answers_before or (status := scripts.status) is None:
-                return False
-            return bool(status.error) or _runs(before, status, file)  # an error says why it does not run
+            elapsed_s = time.monotonic() - began
+            return scripts.answers > answers_before and _is_answer(before, scripts.status, file, elapsed_s)
 
         wait_for(is_answered, scripts.answer_s)
         status = scripts.status
@@ -177,6 +178,16 @@ def _scripts(robot: str, target: Target) -> Iterator[tuple[Transport, RobotScrip
         scripts.subscribe(transport)
         wait_for(lambda: scripts.files is not None and scripts.status is not None, 1.0)
         yield transport, scripts, shown(id_of(names.base))
+
+
+def _is_answer(before: AutonomyStatus | None, now: AutonomyStatus | None, file: str, elapsed_s: float) -> bool:
+    """True if the newest status is the answer to a start: the script runs, or an error says why it does not."""
+    if now is None:
+        return False
+    if _runs(before, now, file):
+        return True
+    is_new_error = before is None or now.error != before.error
+    return bool(now.error) and (is_new_error or elapsed_s > _SAME_ERROR_S)  # an earlier error counts if it stays
 
 
 def _runs(before: AutonomyStatus | None, now: AutonomyStatus, file: str) -> bool:

@@ -6,18 +6,21 @@ import errno
 import json
 import os
 import signal
+import stat
 import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from pebble.errors import PebbleError
 from pebble.services.autonomy_manager import guard
 from pebble.services.autonomy_manager.child import Launch, Process, Processes
 from pebble.services.autonomy_manager.guard import Guard
+from pebble.transports import Message
 from tests.kit.robot import ROBOT, Program, ProgramRobot
 from tests.support import ROOT, WAIT_S, Broker, Child, gone, quickly, refused, until
 
@@ -31,24 +34,28 @@ time.sleep(600)
 
 
 class ManagerRig(ProgramRobot):
-    """``scripts`` of the config are those written with :meth:`script`."""
+    """``scripts`` of the config are those written with :meth:`script`; drive commands are collected as well."""
 
     process: Program | Child | None = None
 
-    def __init__(self, kind: str, port: int) -> None:
+    def __init__(self, kind: str, port: int, **section: Any) -> None:
         super().__init__(kind, port, {}, robot=ROBOT)
         self.root, self.log = self.folder / "scripts", self.folder / "log"
         self.root.mkdir()
-        self.section: dict[str, Any] = {"enabled": True, "autonomy_root": str(self.root), "stop_timeout_seconds": 2}
+        self.drives: list[dict[str, Any]] = []
+        self.world.transport.subscribe(f"{self.world.base}/incoming/drive-values", self._on_drive, direct=True)
+        times = {"stop_timeout_seconds": 2}
+        self.section: dict[str, Any] = {"enabled": True, "autonomy_root": str(self.root), **times, **section}
         self.section["scripts"] = {}
         self.raw["services"] = {"autonomy_manager": self.section}
         self._ends.callback(self.end)
 
-    def script(self, name: str, text: str = SLEEPER, **section: Any) -> Path:
+    def script(self, name: str, text: str = SLEEPER, file: str = "run.py", **section: Any) -> Path:
         """Write a script."""
         folder = self.root / name
         folder.mkdir()
-        (folder / "run.py").write_text(text)
+        (folder / file).write_text(text)
+        (folder / file).chmod(stat.S_IRWXU)
         self.section["scripts"][name] = section
         return folder
 
@@ -80,9 +87,9 @@ class ManagerRig(ProgramRobot):
         status: dict[str, Any] = self.world.newest("autonomy-status")
         return status
 
-    def becomes(self, **fields: Any) -> bool:
+    def becomes(self, timeout: float = WAIT_S, **fields: Any) -> bool:
         """Wait until the status has these fields."""
-        return self.world.became("autonomy-status", **fields)
+        return self.world.became("autonomy-status", timeout, **fields)
 
     def command(self, body: Any, *, retain: bool = False) -> None:
         self.world.command("autonomy-command", body, retain=retain)
@@ -99,6 +106,9 @@ class ManagerRig(ProgramRobot):
 
     def logged(self) -> str:
         return self.process.printed if isinstance(self.process, Program) else self.log.read_text()
+
+    def _on_drive(self, message: Message) -> None:
+        self.drives.append(msgspec.json.decode(message.payload))
 
 
 def started(folder: Path) -> list[tuple[int, list[str], str | None]]:
@@ -177,7 +187,7 @@ def test_a_script_is_listed_started_and_stopped(rig: ManagerRig) -> None:
     rig.run_script("ours")
     assert until(lambda: started(rig.root / "ours"))
     ((_, arguments, run),) = started(rig.root / "ours")
-    assert (arguments[2:], int(run or 0) > 0) == (["--n", "1"], True)
+    assert (arguments[2:], rig.drives[0]["run"] < int(run or 0)) == (["--n", "1"], True)
 
 
 @pytest.mark.parametrize("text", [PARENT, OURS + DEAF + PARENT], ids=["foreign", "ours"])
