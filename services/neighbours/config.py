@@ -15,6 +15,7 @@ from pebble.config.types import EMPTY, ONE_VALUE, Account, Level, Section, Servi
 from pebble.contract import DRIVE, OUTGOING, channel_of, is_reserved
 from pebble.extension import Facts
 
+MOST_NEIGHBOURS, MOST_METRICS = 16, 32  # of one robot; metrics of one neighbour
 _LAN: Path = ("services", "neighbours", "lan")
 _EVERYWHERE = ("0.0.0.0", "::")  # noqa: S104 -- compared only
 
@@ -60,6 +61,9 @@ def _check(reader: Reader, section: Neighbours, path: Path) -> Neighbours:
         reader.notes.doubt((*path, "lan", "connect"), 'is missing, write where the hub listens: ["tls/hub.lab:7447"]')
     if lan.account and (not lan.tls.enabled or lan.tls.client_cert is None):
         problem((*path, "lan", "account"), "needs tls.client_cert, in which it is the name")
+    for key, names in (("commanded", section.commanded), ("listens", section.listens)):
+        if len(names) > MOST_NEIGHBOURS:
+            problem((*path, key), f"has {len(names)} robots: {MOST_NEIGHBOURS} are the most")
     for name, granted in section.commanded.items():
         if any(metric != DRIVE.metric for metric in granted):
             problem((*path, "commanded", name), f'must be ["{DRIVE.metric}"]: nothing else can be granted')
@@ -67,6 +71,8 @@ def _check(reader: Reader, section: Neighbours, path: Path) -> Neighbours:
     for name, heard in section.listens.items():
         metrics_at["listens", name] = heard
     for place, metrics in metrics_at.items():
+        if len(metrics) > MOST_METRICS:
+            problem((*path, *place), f"has {len(metrics)} metrics: {MOST_METRICS} are the most")
         for metric in metrics:
             channel = channel_of(f"{OUTGOING}/{metric}")
             is_forwarded = channel is None or (channel.remote and channel.bridged)  # by bridges, to operators

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 import queue
 import selectors
@@ -27,6 +26,7 @@ CHECK_S = 1.0  # how often the registration is checked
 REVIVE_S = 2.0  # a subscriber that the master lists, and that is not connected, is told again so often
 GREETING_S = 2.0  # so long a new connection may take to say what it wants
 _MOST_GREETINGS = 32  # connections at once that have not said yet what they want; more are closed
+_MOST_CALLS_WAITING = 256  # calls of other nodes that wait to be made; more are made at the next check
 _QUIET_S, _PROBE_S, _PROBES = 10, 5, 3  # a publisher of whose machine nothing is heard is given up after 25 s
 
 
@@ -51,8 +51,8 @@ class Subscription:
 class Node:
     """A node of ROS 1. Call :meth:`advertise` and :meth:`subscribe`, then :meth:`start`.
 
-    One thread has the sockets, one serves the API of the node, one calls the master and publishers; each call of a lost
-    subscriber has one of its own. None waits for another, so a long call delays no message.
+    One thread has the sockets, one serves the API of the node, one calls the master and publishers, one calls
+    lost subscribers (listed by the master, not connected). None waits for another, so a long call delays no message.
     ``on_evicted(why)`` is called, on some thread, when another node has the name: nothing may move from then on.
     """
 
@@ -69,10 +69,12 @@ class Node:
         #: Lost subscribers by topic and node: the master lists them, but they are not connected. Since when, or when
         #: they were last told again that this node publishes the topic.
         self._missing: dict[tuple[str, str], float] = {}
-        self._revivals = itertools.count(1)  # a number for each time that a lost subscriber is told
+        self._lost: dict[tuple[str, str], list[str]] = {}  # those to tell now, and the topic's publishers
+        self._wake_lost = threading.Event()  # wakes the thread that tells lost subscribers
+        self._revived = 0  # how often a lost subscriber was told
         self._ends = threading.Event()
         self._threads: list[threading.Thread] = []
-        self._calls: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # of other nodes, to be made
+        self._calls: queue.Queue[Callable[[], None]] = queue.Queue(_MOST_CALLS_WAITING)
         self._jobs: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # of the thread of sockets
         self._greetings: dict[Subscriber, float] = {}  # connections without a request yet, and when they were made
         self._select = selectors.DefaultSelector()
@@ -97,7 +99,7 @@ class Node:
     def start(self) -> None:
         self._select.register(self._listener, selectors.EVENT_READ, self._accept)
         self._select.register(self._wakes, selectors.EVENT_READ, lambda: self._wakes.recv(4096))
-        for run in (self._run_sockets, self._run_calls, self._run_api):
+        for run in (self._run_sockets, self._run_calls, self._run_lost, self._run_api):
             thread = threading.Thread(target=run, name=f"ros{run.__name__}", daemon=True)
             self._threads.append(thread)
             thread.start()
@@ -107,6 +109,7 @@ class Node:
         for publication in self._publications.values():
             publication.finish()
         self._ends.set()
+        self._wake_lost.set()
         self._wake()
         with suppress(RosError):  # if one call fails, the others wait in vain, too
             for topic in self._publications:
@@ -150,6 +153,12 @@ class Node:
         self._on_evicted(self.problem)
         for publication in self._publications.values():
             publication.remove_all("another node has this name")
+
+    def published(self) -> list[list[str]]:
+        return [[topic, publication.form.kind] for topic, publication in self._publications.items()]
+
+    def subscribed(self) -> list[list[str]]:
+        return [[topic, subscription.form.kind] for topic, subscription in self._subscriptions.items()]
 
     def _run_api(self) -> None:
         self._api.serve_forever(poll_interval=0.1)
@@ -220,9 +229,9 @@ class Node:
             return ""
 
     def _revive(self, publishers: Mapping[str, list[str]], subscribers: Mapping[str, list[str]]) -> None:
-        """Tell lost subscribers, which the master lists and which are not connected, of this node, every REVIVE_S.
+        """Find lost subscribers: those that the master lists, and that are not connected. Queue them to be told again.
 
-        By itself each would wait for minutes after the network was cut. One that hangs delays only its own thread.
+        Each is told of this node every REVIVE_S: by itself it would wait for minutes after the network was cut.
         """
         now = time.monotonic()
         missing: dict[tuple[str, str], float] = {}
@@ -234,20 +243,33 @@ class Node:
         for (topic, node), since in missing.items():
             if now - since >= REVIVE_S:
                 missing[topic, node] = now
-                tell = partial(self._tell, topic, node, publishers.get(topic, []))
-                threading.Thread(target=self._attempt_call, args=(tell,), daemon=True).start()
+                self._lost[topic, node] = publishers.get(topic, [])
         self._missing = missing
+        self._wake_lost.set()
+
+    def _run_lost(self) -> None:
+        while not self._ends.is_set():
+            self._wake_lost.wait()
+            self._wake_lost.clear()
+            while self._lost and not self._ends.is_set():
+                topic, node = next(iter(tuple(self._lost)))  # the oldest; a copy, as another thread adds to it
+                publishers = self._lost.pop((topic, node))
+                self._attempt_call(partial(self._tell, topic, node, publishers))
 
     def _tell(self, topic: str, node: str, publishers: list[str]) -> None:
         uri = self._uri_of(node)
         others = filter(None, [self._uri_of(name) for name in publishers if name != self.name])
-        # rospy ignores an address that it believes to be connected to, and any path is ours
-        call(uri, "publisherUpdate", "/master", topic, [*others, f"{self.uri}{next(self._revivals)}/"])
+        self._revived += 1  # rospy ignores an address that it believes to be connected to, and any path is ours
+        call(uri, "publisherUpdate", "/master", topic, [*others, f"{self.uri}{self._revived}/"])
         log.info("%s: told %s again that this node publishes it", topic, node)
 
     def _connect_soon(self, subscription: Subscription, source: Source) -> None:
         source.asked = True
-        self._calls.put(lambda: self._connect(subscription, source))
+        try:
+            self._calls.put_nowait(lambda: self._connect(subscription, source))
+        except queue.Full:
+            source.asked = False
+            self._refuse("waiting calls", "calls of other nodes that waited")
 
     def _attempt_call(self, job: Callable[[], None]) -> None:
         try:

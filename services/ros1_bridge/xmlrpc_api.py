@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 import xmlrpc.client
 from collections.abc import Callable
+from contextlib import suppress
 from http.client import HTTPConnection
+from socket import SHUT_RDWR
 from socketserver import ThreadingMixIn
 from typing import Any, Protocol
 from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
@@ -15,6 +18,7 @@ from pebble.services.ros1_bridge.wire import MOST_HEADER, RosError
 
 CALL_S = 2.0  # longest wait of a call for the master or another node
 _MOST_CALLS = 16  # calls of others that are answered at once; more are hung up on
+_OLD_S = 2 * CALL_S  # a call of others that takes longer makes room for a new one
 
 
 class _Timed(xmlrpc.client.Transport):
@@ -68,21 +72,34 @@ class ApiServer(ThreadingMixIn, SimpleXMLRPCServer):
     def __init__(self, host: str, on_refused: Callable[[], object]) -> None:
         super().__init__((host, 0), _Handler, logRequests=False, allow_none=True)
         self._on_refused = on_refused
-        self._room = threading.Semaphore(_MOST_CALLS)
+        self._lock = threading.Lock()
+        self._began: dict[Any, float] = {}  # the sockets of calls, the oldest first
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer a call on a thread of its own. If there are too many, refuse it; those that hang end after CALL_S."""
-        if self._room.acquire(blocking=False):
-            super().process_request(request, client_address)
-        else:
+        """Answer a call on a thread of its own. If there are too many, refuse it, and end the oldest if that one hangs.
+
+        The next call then finds room: callers that hang do not keep others out.
+        """
+        now = time.monotonic()
+        with self._lock:
+            refused = len(self._began) >= _MOST_CALLS
+            if refused:
+                oldest, began = next(iter(self._began.items()))
+                if now - began > _OLD_S:
+                    with suppress(OSError):
+                        oldest.shutdown(SHUT_RDWR)  # its thread ends by it
+            else:
+                self._began[request] = now
+        if refused:
             self._on_refused()
             self.shutdown_request(request)
+        else:
+            super().process_request(request, client_address)
 
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
-        try:
-            super().process_request_thread(request, client_address)
-        finally:
-            self._room.release()
+    def shutdown_request(self, request: Any) -> None:
+        with self._lock:
+            self._began.pop(request, None)
+        super().shutdown_request(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Log nothing: a caller may hang up at any time."""
@@ -91,9 +108,13 @@ class ApiServer(ThreadingMixIn, SimpleXMLRPCServer):
 class Answers(Protocol):
     """The node's answers to calls of its API."""
 
+    master: str
+
     def publishers_are(self, topic: str, uris: list[str]) -> None: ...
     def address_of(self, topic: str) -> tuple[str, int] | None: ...
     def evict(self, why: str) -> None: ...
+    def published(self) -> list[list[str]]: ...
+    def subscribed(self) -> list[list[str]]: ...
 
 
 def serve(node: Answers, host: str, on_refused: Callable[[], object]) -> ApiServer:
@@ -122,7 +143,12 @@ def serve(node: Answers, host: str, on_refused: Callable[[], object]) -> ApiServ
         "requestTopic": request_topic,
         "shutdown": shutdown,
         "getPid": lambda _caller: [1, "", os.getpid()],
-        "getBusInfo": lambda _caller: [1, "", []],  # what `rosnode info` asks
+        "getMasterUri": lambda _caller: [1, "", node.master],
+        "getPublications": lambda _caller: [1, "", node.published()],
+        "getSubscriptions": lambda _caller: [1, "", node.subscribed()],
+        "getBusStats": lambda _caller: [1, "", [[], [], []]],
+        "getBusInfo": lambda _caller: [1, "", []],
+        "paramUpdate": lambda _caller, _key, _value: [1, "", 0],
     }
     for name, function in api.items():
         server.register_function(function, name)

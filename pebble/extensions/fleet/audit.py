@@ -52,9 +52,7 @@ class Audit:
     """The audit log of a page server. Thread-safe; :meth:`write` never blocks."""
 
     def __init__(self, path: Path | None) -> None:
-        self._database = Database(path, _TABLES)
-        with self._database.transaction() as connection:  # another process may do the same
-            _take_over(connection)
+        self._database = Database(path, _TABLES, _take_over)
         self._lock = threading.Lock()
         self._written = 0
         self._writer = RowWriter(self._store)
@@ -120,9 +118,11 @@ def _values(row: Row) -> tuple[float | str | int, ...]:
 
 def _take_over(database: sqlite3.Connection) -> None:
     """Move the rows of an older version's tables into the present one."""
+    database.execute("BEGIN IMMEDIATE")  # another process may do the same
     if "count" not in {row[1] for row in database.execute("PRAGMA table_info(audit)")}:
         database.execute("ALTER TABLE audit ADD COLUMN count INTEGER NOT NULL DEFAULT 1")
     if list(database.execute("PRAGMA table_info(refused)")):
         database.execute(f"INSERT INTO audit ({_COLUMNS}) SELECT {_COLUMNS} FROM refused")  # noqa: S608
         database.execute("DROP TABLE refused")
     database.execute("DROP TABLE IF EXISTS marks")  # what it noted of robots' own audits
+    database.execute("COMMIT")

@@ -3,7 +3,7 @@
 import errno
 import os
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -29,10 +29,12 @@ class Database:
 
     ``path`` None: in memory. If the file is removed or replaced, the connection continues with the file that it opened.
     A new file, and what SQLite writes beside it, is readable only by its owner. Raises PebbleError if it cannot be
-    opened.
+    opened; ``upgrade`` changes the tables of older versions.
     """
 
-    def __init__(self, path: Path | None, tables: str) -> None:
+    def __init__(
+        self, path: Path | None, tables: str, upgrade: Callable[[sqlite3.Connection], None] = lambda _connection: None
+    ) -> None:
         self._path = path
         if path is not None:
             require_own(path.parent)
@@ -42,15 +44,8 @@ class Database:
                 require_own(path.parent)  # another user may have been faster
                 if not path.exists():
                     os.close(os.open(path, os.O_RDWR | os.O_CREAT, 0o600))
-                if path.is_dir():
-                    raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-                set_mode(path, 0o600)
-            where = ":memory:" if path is None else str(path)
-            self._connection = sqlite3.connect(where, _BUSY_S, isolation_level=None, check_same_thread=False)
-            self._connection.execute("PRAGMA journal_mode = WAL")
-            self._connection.execute("PRAGMA synchronous = NORMAL")
-            self._connection.execute("PRAGMA foreign_keys = ON")
-            self._connection.executescript(tables)
+            self._connection = _connection(path, tables)
+            upgrade(self._connection)
             self._own = None if path is None else OwnFile(path)
         except (OSError, sqlite3.Error) as error:
             why = DatabaseError(path, error).why.replace("is locked", "is locked, or its file system has no locks")
@@ -106,3 +101,18 @@ class Database:
 
     def close(self) -> None:
         self._connection.close()
+
+
+def _connection(path: Path | None, tables: str) -> sqlite3.Connection:
+    """Open the file, which exists already, and create missing tables. Raises OSError and sqlite3.Error."""
+    if path is not None:
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+        set_mode(path, 0o600)
+    where = ":memory:" if path is None else str(path)
+    connection = sqlite3.connect(where, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
+    connection.execute("PRAGMA journal_mode = WAL")
+    connection.execute("PRAGMA synchronous = NORMAL")
+    connection.execute("PRAGMA foreign_keys = ON")
+    connection.executescript(tables)
+    return connection

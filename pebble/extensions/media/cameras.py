@@ -56,6 +56,11 @@ class Camera:
         self._run_dir = run_dir
         self._reader = FrameReader(run_dir, STREAM, views=views).open()
 
+    @property
+    def counters(self) -> dict[str, int]:
+        """Numbers of frames that were read, skipped and lost so far: see `FrameReader`."""
+        return self._reader.counters.snapshot()
+
     def __iter__(self) -> Self:
         return self
 

@@ -94,6 +94,8 @@ def settings(entry: Entry, words: Sequence[str]) -> dict[str, Any]:
             names = ", ".join(options) or "it has none"
             raise PebbleError(f"{option} is no option of {entry['file']}: {names}")
         setting, value = options[option]
+        if value is not None and equals_sign:
+            raise PebbleError(f"{option} takes no value: its opposite is an option of its own")
         if value is None and not equals_sign:  # the value is the next word
             following = next(remaining, None)
             if following is None:

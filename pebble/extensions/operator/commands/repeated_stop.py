@@ -6,7 +6,6 @@ import logging
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from contextlib import ExitStack, closing, suppress
 from functools import partial
 
@@ -91,7 +90,7 @@ def _repeat(bases: list[str], sender: StopSender, outbox: _Outbox, report: _Repo
         heartbeats = _heartbeats(outbox.transport, opened) if every else None
         second = opened.enter_context(listening(outbox.transport))
         listener, subscribing = _listen(second, bases)
-        naming_others: Iterator[None] = iter(()) if every else _naming_others(outbox, sender, opened, report)
+        others = None if every else _OtherRobots(outbox.transport, sender, opened, report)
         while not sender.finished:
             for message in heartbeats.take() if heartbeats else ():
                 sender.receive(message, time.monotonic())
@@ -100,8 +99,9 @@ def _repeat(bases: list[str], sender: StopSender, outbox: _Outbox, report: _Repo
             _drop_other_spelling(sender)
             outbox.publish()
             report.update(time.monotonic())
-            with suppress(Exception):  # a line about other robots ends no repetition
-                next(naming_others, None)
+            if others is not None:
+                with suppress(Exception):  # a line about other robots ends no repetition
+                    others.look(time.monotonic())
         # wait for the robot's status, which may come last: by it the report says whether the motors obey
         subscribing.join(ANSWER_S)
         wait_for(lambda: second.state is State.CONNECTED, ANSWER_S)
@@ -127,30 +127,33 @@ def _heartbeats(transport: Transport, opened: ExitStack) -> Heartbeats | None:
     return opened.enter_context(closing(Heartbeats(settings)))
 
 
-def _naming_others(outbox: _Outbox, sender: StopSender, opened: ExitStack, report: _Report) -> Iterator[None]:
-    """Name in one line the robots that are heard while nothing comes from the one to be stopped: it may be mistyped.
+class _OtherRobots:
+    """The robots that are heard while nothing comes from the one to be stopped: its name may be mistyped."""
 
-    A step of this iterator takes no time; connections are closed by ``opened``.
-    """
-    began = time.monotonic()
-    while time.monotonic() < began + _QUICK_S:
-        yield
-    if any(robot.live or robot.estop.has_capabilities for robot in sender.robots.values()):
-        return
-    heartbeats = _heartbeats(outbox.transport, opened)
-    if heartbeats is None:
-        return
-    began = time.monotonic()
-    while time.monotonic() < began + _OTHERS_S:
-        yield
-    messages = heartbeats.take()
-    threading.Thread(target=heartbeats.close, daemon=True).start()  # on a thin link no stop waits for more
-    addresses = (parse_topic(message.topic) for message in messages if not message.retain)
-    robots = {address.identity for address in addresses if address is not None and not address.identity.is_server}
-    if robots and not any(robot.base in sender.robots for robot in robots):
-        name, names = id_of(next(iter(sender.robots))), sorted(id_of(robot.base) for robot in robots)
-        more = ", …" if len(names) > _NAMED else ""
-        report.say(f"pebble: nothing comes from {name}; heard here: {', '.join(names[:_NAMED])}{more}", err=True)
+    def __init__(self, transport: Transport, sender: StopSender, opened: ExitStack, report: _Report) -> None:
+        self._transport, self._sender, self._opened, self._report = transport, sender, opened, report
+        self._due = time.monotonic() + _QUICK_S
+        self._heartbeats: Heartbeats | None = None
+
+    def look(self, now: float) -> None:
+        """Once nothing has come for long enough, listen to others; name them in one line a little later."""
+        if now < self._due or any(robot.live or robot.estop.has_capabilities for robot in self._sender.robots.values()):
+            return
+        self._due = float("inf")
+        if self._heartbeats is None:
+            self._heartbeats = _heartbeats(self._transport, self._opened)
+            if self._heartbeats is not None:
+                self._due = now + _OTHERS_S
+            return
+        messages = self._heartbeats.take()
+        threading.Thread(target=self._heartbeats.close, daemon=True).start()  # on a thin link no stop waits for more
+        addresses = (parse_topic(message.topic) for message in messages if not message.retain)
+        robots = {address.identity for address in addresses if address is not None and not address.identity.is_server}
+        if robots and not any(robot.base in self._sender.robots for robot in robots):
+            name, names = id_of(next(iter(self._sender.robots))), sorted(id_of(robot.base) for robot in robots)
+            more = ", …" if len(names) > _NAMED else ""
+            heard = f"heard here: {', '.join(names[:_NAMED])}{more}"
+            self._report.say(f"pebble: nothing comes from {name}; {heard}", err=True)
 
 
 def _drop_other_spelling(sender: StopSender) -> None:

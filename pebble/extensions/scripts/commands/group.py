@@ -1,11 +1,8 @@
 """``pebble script``: writes a new script, and lists, starts and stops those of a robot."""
 
-import re
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.resources import files
 from pathlib import Path
 from typing import Annotated
 
@@ -19,11 +16,9 @@ from pebble.extensions.operator.client import forms
 from pebble.extensions.operator.client.connection import Target, connected, put_account_into_topics, target_of, wait_for
 from pebble.extensions.operator.client.driveable import doubt_of
 from pebble.extensions.operator.client.names import id_of
-from pebble.extensions.operator.client.scripts import RobotScripts
+from pebble.extensions.operator.client.scripts import RobotScripts, options_of
 from pebble.extensions.operator.commands.options import RobotArgument
 from pebble.extensions.operator.commands.target import with_target
-from pebble.extensions.scripts.script.options import usage
-from pebble.runtime.as_owner import as_owner
 from pebble.transports import Transport
 
 _HELP = """Programs that move a robot by themselves; docs/ext/scripts.md explains them.
@@ -34,7 +29,6 @@ _HELP = """Programs that move a robot by themselves; docs/ext/scripts.md explain
     pebble script start goob.json follow --tag-id 7
     pebble script stop goob.json
 """
-_is_name = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,62}").fullmatch
 _FIRST_SECOND_S = 1.0  # most mistakes in a script end it within that
 _SAME_ERROR_S = 1.0  # an error that was there before the command is the answer to it, too, if it stays
 
@@ -50,30 +44,10 @@ def new(
         cd follow
         python -m pytest
     """
-    if not _is_name(name):
-        raise PebbleError(f"{name!r}: a script's name is letters, digits, - and _, beginning with a letter")
-    target = folder / name
-    try:
-        if (alike := _alike(target)) is not None:
-            raise PebbleError(f"{alike} exists already: choose another name, or another --folder")
-        with as_owner(folder):
-            target.mkdir(parents=True)
-    except OSError as error:
-        raise PebbleError(f"{target}: {error.strerror}") from None
-    world = Path(tempfile.gettempdir(), "pebble-world-room")
-    #: With absolute paths, so that `pebble up` works in every folder.
-    robot = _starter("goob.json").replace("{folder}", str(target.absolute())).replace("{world}", str(world))
-    texts = {
-        "run.py": _starter("run.py.txt"),
-        f"test_{name.replace('-', '_')}.py": _starter("test_run.py.txt"),
-        "room.json": files("pebble.extensions.lab.simulation.world").joinpath("room.json").read_text(encoding="utf-8"),
-        "goob.json": robot,
-        "pytest.ini": _starter("pytest.ini"),
-    }
-    for file, text in texts.items():
-        with as_owner(target):
-            (target / file).write_text(text, encoding="utf-8")
-        typer.echo(target / file)
+    from pebble.extensions.scripts.commands.new import write
+
+    for path in write(name, folder):
+        typer.echo(path)
 
 
 @with_target()
@@ -86,7 +60,7 @@ def list_(robot: RobotArgument, *, target: Target) -> int:
             label = str(entry.get("label") or file)
             _print(file if label == file else f"{file}: {label}")
             for setting in forms.listed(entry.get("configs")):
-                _print(f"    {usage(setting)}")
+                _print(f"    {_option(setting)}")
         if scripts.status is not None:
             _print_status(scripts.status, scripts)
     return 0
@@ -157,17 +131,6 @@ def register(app: typer.Typer) -> None:
     app.add_typer(group, name="script")
 
 
-def _alike(target: Path) -> Path | None:
-    """Return an existing path that differs only in case, which many file systems ignore; else None."""
-    if not target.parent.is_dir():
-        return None
-    return next((path for path in target.parent.iterdir() if path.name.lower() == target.name.lower()), None)
-
-
-def _starter(file: str) -> str:
-    return files("pebble.extensions.scripts.commands").joinpath("starter", file).read_text(encoding="utf-8")
-
-
 @contextmanager
 def _scripts(robot: str, target: Target) -> Iterator[tuple[Transport, RobotScripts, str]]:
     """Yield the connection, the robot's published scripts, and its name."""
@@ -219,6 +182,25 @@ def _print_status(status: AutonomyStatus, scripts: RobotScripts) -> None:
         _print("no script runs")
     if status.error:
         _print(f"error: {status.error}")
+
+
+def _option(setting: forms.Setting) -> str:
+    """Return an option's line, such as ``--tag-id INT  Tag ID (default: 13)``."""
+    names: dict[bool | None, str] = {}  # the first option for each value of a flag; None: for other settings
+    for option, value in options_of(setting):
+        names.setdefault(value, option)
+    usage = f"{names.get(None)} {setting.type.upper()}"
+    if setting.type == "bool":
+        usage = f"[{names[True]} | {names[False]}]"
+    notes = []
+    if setting.options:
+        notes.append(", ".join(map(str, setting.options)))
+    if setting.min is not None:
+        notes.append(f"min {setting.min}")
+    if setting.max is not None:
+        notes.append(f"max {setting.max}")
+    notes.append("required" if setting.required else f"default: {setting.default}")
+    return f"{usage:32}  {setting.label or setting.key} ({'; '.join(notes)})"
 
 
 def _print(line: str) -> None:

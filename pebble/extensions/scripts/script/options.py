@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import os
+import argparse
 import sys
 import typing
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any, Literal, NoReturn, TypeVar
 
 import msgspec
 from msgspec import NODEFAULT, inspect
 from msgspec.structs import replace
 
-from pebble.errors import PebbleError
 from pebble.extensions.operator.client.forms import Setting, SettingError, Value, accepted
-from pebble.extensions.operator.client.scripts import options_of, settings
-from pebble.extensions.scripts.runs import CONFIG
 
 Options = TypeVar("Options", bound=msgspec.Struct)
 
@@ -27,9 +24,6 @@ _KINDS: dict[type[inspect.Type], str] = {
     inspect.LiteralType: "enum",
 }
 _RESERVED = ("config", "describe", "help")  # options that every script has
-_OF_ALL = f"""\
-    --config FILE                     The robot's config file (default: ${CONFIG})
-    --describe                        Print the form that operators see, as JSON; only alone"""
 
 
 def form(options: type[msgspec.Struct]) -> list[Setting]:
@@ -43,43 +37,33 @@ def form(options: type[msgspec.Struct]) -> list[Setting]:
     return settings
 
 
-def parse(options: type[Options], words: list[str], program: str, about: str) -> tuple[Options, Path]:
-    """Return the Struct that the words of a command line describe, and the path of the robot's config.
+def parse(
+    options: type[Options], arguments: list[str], parser: argparse.ArgumentParser
+) -> tuple[Options, argparse.Namespace]:
+    """Return the Struct that the words of a command line describe, and the values of all options of ``parser``.
 
-    ``--help`` prints ``about`` and the options, and ends the process; wrong words end it with exit code 2 and one line
-    on stderr.
+    Wrong words end the process with exit code 2 and one line on stderr.
     """
-    own = form(options)
-    if not {"-h", "--help"}.isdisjoint(words):
-        lines = [f"{program}: {about}", "", *(f"    {usage(setting)}" for setting in own), _OF_ALL]
-        sys.stdout.write("\n".join(lines) + "\n")
-        raise SystemExit(0)
-    if "--describe" in words:  # not as the only word, which `run` has handled before
-        _fail(program, "--describe goes alone: it prints the form and starts nothing")
-    config, rest, remaining = os.environ.get(CONFIG), list[str](), iter(words)
-    for word in remaining:
-        option, equals_sign, value = word.partition("=")
-        if option == "--config":
-            config = value if equals_sign else next(remaining, None)
-        else:
-            rest.append(word)
+    settings = form(options)
+    for setting in settings:
+        _add(parser, setting)
+    namespace = parser.parse_args(_joined(arguments, settings))
+    values = {setting.key: getattr(namespace, setting.key) for setting in settings}
     try:
-        given = settings({"file": program, "configs": [setting.entry() for setting in own]}, rest)
-        for setting in own:
-            if setting.required and setting.default is None and setting.key not in given:
-                _fail(program, f"{setting.arg} is missing")
-        chosen = msgspec.convert(given, options)
-    except (PebbleError, msgspec.ValidationError) as error:
-        _fail(program, str(error))
-    if config is None:
-        _fail(program, "which robot? Add its config file, for example: --config goob.json")
-    return chosen, Path(config)
+        return msgspec.convert({key: value for key, value in values.items() if value is not None}, options), namespace
+    except msgspec.ValidationError as error:
+        parser.error(str(error))
 
 
-def _fail(program: str, why: str) -> NoReturn:
-    """End the process because of wrong words."""
-    sys.stderr.write(f"{program}: {why} (see --help)\n")
-    raise SystemExit(2)
+class OneLineParser(argparse.ArgumentParser):
+    """An argument parser whose errors are one line, and which accepts no abbreviated options."""
+
+    def __init__(self, *, prog: str, description: str = "") -> None:
+        super().__init__(prog=prog, description=description, allow_abbrev=False)
+
+    def error(self, message: str) -> NoReturn:
+        sys.stderr.write(f"{self.prog}: {message} (see --help)\n")
+        raise SystemExit(2)
 
 
 # -- a field becomes a setting
@@ -162,23 +146,56 @@ def _default(field: inspect.Field, setting: Setting) -> Value:
         raise TypeError(f"option {field.name}: its default {field.default!r} is refused: {error}") from None
 
 
-# -- a setting in words
+# -- a setting becomes an option of the command line
 
 
-def usage(setting: Setting) -> str:
-    """Return an option's line, such as ``--tag-id INT  Tag ID (default: 13)``."""
-    names: dict[bool | None, str] = {}  # the first option for each value of a flag; None: for other settings
-    for option, value in options_of(setting):
-        names.setdefault(value, option)
-    words = f"{names.get(None)} {setting.type.upper()}"
+def _add(parser: argparse.ArgumentParser, setting: Setting) -> None:
+    """Add the setting to the options of the command line."""
     if setting.type == "bool":
-        words = f"[{names[True]} | {names[False]}]"
-    notes = []
-    if setting.options:
-        notes.append(", ".join(map(str, setting.options)))
-    if setting.min is not None:
-        notes.append(f"min {setting.min}")
-    if setting.max is not None:
-        notes.append(f"max {setting.max}")
-    notes.append("required" if setting.required else f"default: {setting.default}")
-    return f"{words:32}  {setting.label or setting.key} ({'; '.join(notes)})"
+        help_ = f"{setting.label} (default: {'on' if setting.default else 'off'})"
+        action = argparse.BooleanOptionalAction
+        # default=None: if the option is not given, `parse` leaves the default to the Struct.
+        parser.add_argument(str(setting.arg), dest=setting.key, action=action, default=None, help=help_)
+        return
+    parser.add_argument(
+        str(setting.arg),
+        dest=setting.key,
+        metavar=setting.type.upper(),
+        type=str if setting.type == "string" else _converter(setting),
+        required=setting.required and setting.default is None,
+        help=_help(setting),
+    )
+
+
+def _help(setting: Setting) -> str:
+    notes = [f"one of {', '.join(map(str, setting.options))}"] if setting.options else []
+    if setting.min is not None and setting.max is not None:
+        notes.append(f"{setting.min:g} to {setting.max:g}")
+    elif setting.min is not None:
+        notes.append(f"at least {setting.min:g}")
+    elif setting.max is not None:
+        notes.append(f"at most {setting.max:g}")
+    default = "none" if setting.default is None else str(setting.default)
+    notes.append("required" if setting.required else f"default: {default}")
+    return f"{setting.label} ({'; '.join(notes)})".replace("%", "%%")
+
+
+def _converter(setting: Setting) -> Callable[[str], object]:
+    def convert(text: str) -> object:
+        try:
+            return accepted(setting, text)
+        except SettingError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+
+    return convert
+
+
+def _joined(arguments: list[str], settings: list[Setting]) -> list[str]:
+    """Return words with ``--x=-1e-05`` for ``--x -1e-05``, which argparse would take for an option."""
+    valued = {setting.arg for setting in settings if setting.type != "bool"}
+    joined: list[str] = []
+    words = iter(arguments)
+    for word in words:
+        value = next(words, None) if word in valued else None  # the next word, which the loop leaves out then
+        joined.append(word if value is None else f"{word}={value}")
+    return joined

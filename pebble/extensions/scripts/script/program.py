@@ -15,9 +15,9 @@ from pebble.config import Config, load
 from pebble.contract.payloads import LAST_RUN, LONGEST_SUMMARY, MOST_MAIN
 from pebble.errors import ConfigError, PebbleError, TransportError
 from pebble.extensions.operator.places import launcher_runs
-from pebble.extensions.scripts.runs import RUN, LocalScriptsLock, next_run
+from pebble.extensions.scripts.runs import CONFIG, RUN, LocalScriptsLock, next_run
 from pebble.extensions.scripts.script.guard import END_S, Guard
-from pebble.extensions.scripts.script.options import form, parse
+from pebble.extensions.scripts.script.options import OneLineParser, form, parse
 from pebble.extensions.scripts.script.robot import EXIT_ENDED, Robot
 from pebble.runtime.connections import local_transport
 from pebble.runtime.parent import set_up_logging
@@ -51,12 +51,11 @@ def run(
         words = {"label": label or name, "summary": summary or _first_line(main)}
         _describe(words, options, main_options, needs or {}, drives=drives)
         return
-    about = _documentation(main) or label or name
-    chosen, config = parse(options or msgspec.Struct, sys.argv[1:], Path(sys.argv[0]).name, about)
+    arguments = _arguments(main, label or name, options)
     set_up_logging("INFO")
     sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
     try:
-        _Program(name, drives=drives).run(main, config, () if options is None else (chosen,))
+        _Program(name, drives=drives).run(main, *arguments)
     except PebbleError as error:
         for line in str(error).splitlines():
             log.error("%s", line)
@@ -131,6 +130,32 @@ def _describe(
     if not drives:
         description["drives"] = False
     sys.stdout.write(msgspec.json.encode(description).decode() + "\n")
+
+
+def _arguments(
+    main: Callable[..., None], label: str, options: type[msgspec.Struct] | None
+) -> tuple[Path, tuple[msgspec.Struct, ...]]:
+    """Return the robot's config file, and main's further arguments, from the command line."""
+    parser = OneLineParser(prog=Path(sys.argv[0]).name, description=_documentation(main) or label)
+    parser.add_argument(
+        "--config",
+        metavar="ROBOT.json",
+        default=os.environ.get(CONFIG),
+        help=f"the robot's config file (default: ${CONFIG})",
+    )
+    parser.add_argument(
+        "--describe", action="store_true", help="print the form that operators see, as JSON; only alone"
+    )
+    chosen, values = parse(options or _NoOptions, sys.argv[1:], parser)
+    if values.describe:  # not as the only word, which `run` has handled before
+        parser.error("--describe goes alone: it prints the form and starts nothing")
+    if values.config is None:
+        parser.error("which robot? Add its config file, for example: --config goob.json")
+    return Path(values.config), () if options is None else (chosen,)
+
+
+class _NoOptions(msgspec.Struct):
+    """The options of a script that has none."""
 
 
 class _Program:

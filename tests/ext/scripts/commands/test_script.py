@@ -17,7 +17,9 @@ import pytest
 
 from pebble.contract import AUTONOMY_COMMAND, AUTONOMY_FILES, AUTONOMY_STATUS, STATUS, WHEEL_ODOMETRY, Channel, codec
 from pebble.contract.payloads import AutonomyFiles, AutonomyStatus, Status, WheelOdometry
+from pebble.errors import PebbleError
 from pebble.extensions.lab.simulation.world.script_robot import SimulatedRobot
+from pebble.extensions.operator.client.scripts import settings
 from pebble.transports import Message, MqttSettings, QoS, create
 from tests.commands.command_line import GOOB, Run, config_file
 from tests.support import ROOT, Broker, until
@@ -144,6 +146,32 @@ def test_the_list_ends_with_what_runs(run: Run, config: Path, manager: Manager) 
     assert run("script", "list", config) == 0
     assert run.out.splitlines()[-1] == "goob: Cannot be driven: serial: no board"
     manager.judge("yes")
+
+
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        (["--tagid", "3"], "--tagid is no option of follow: --tag-id, --speed, --search, --no-search, --size-m"),
+        (["--tag-id"], "--tag-id needs a value"),
+        (["--tag-id", "x"], "--tag-id of follow: tag_id must be a whole number"),
+        (["--search=off"], "--search takes no value: its opposite is an option of its own"),
+    ],
+)
+def test_wrong_options_are_named(words: list[str], problem: str) -> None:
+    with pytest.raises(PebbleError) as error:
+        settings(ENTRY, words)
+    assert str(error.value) == problem
+
+
+@pytest.mark.parametrize(
+    "words", [["--marker-id=7", "--preview"], ["--tag-id", "7", "--preview"]], ids=["own", "by key"]
+)
+def test_an_option_is_the_scripts_own_or_made_of_its_key(words: list[str]) -> None:
+    form = [
+        {"key": "tag_id", "type": "int", "arg": "--marker-id"},
+        {"key": "preview", "type": "bool", "arg": "--preview"},
+    ]
+    assert settings({"file": "follow", "configs": form}, words) == {"tag_id": 7, "preview": True}
 
 
 # -- what ``pebble script new`` writes works as it is, and its test would notice if it did not

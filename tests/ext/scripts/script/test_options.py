@@ -12,7 +12,7 @@ import pytest
 from msgspec import Meta, Struct
 
 from pebble.extensions.scripts.script import Robot, run
-from pebble.extensions.scripts.script.options import form, parse
+from pebble.extensions.scripts.script.options import OneLineParser, form, parse
 
 
 class Options(Struct, kw_only=True):
@@ -31,7 +31,7 @@ class Options(Struct, kw_only=True):
 
 
 def parsed(*arguments: str) -> Options:
-    return parse(Options, ["--config=goob.json", "--tag-size-m", "0.25", *arguments], "run.py", "")[0]
+    return parse(Options, ["--tag-size-m", "0.25", *arguments], OneLineParser(prog="run.py"))[0]
 
 
 def walk(robot: Robot, options: Options) -> None:
@@ -52,6 +52,10 @@ def test_a_script_describes_itself_in_one_line(
         "configs": json.loads(Path(__file__).with_name("form.json").read_bytes()),
         "dependencies": [{"file": "wheel-odometry", "config": {"magnets": 10}}],
     }
+    monkeypatch.setattr(sys, "argv", ["run.py", "--describe", "--tag-size-m", "1"])
+    with pytest.raises(SystemExit, match="2"):
+        run(walk)
+    assert "--describe goes alone" in capsys.readouterr().err
     monkeypatch.setattr(sys, "argv", ["run.py", "--describe"])
     for main_options, problem in ((["speedd"], "there is no option speedd"), (["power"] * 4, "4 are more than 3")):
         with pytest.raises(TypeError, match=f"main_options: {problem}"):
@@ -63,7 +67,7 @@ def test_a_script_describes_itself_in_one_line(
     [
         ("--tag-id 7", "tag_id", 7), ("--power -1e-05", "power", -1e-05), ("--power=-0.5", "power", -0.5),
         ("--speed fast", "speed", "fast"), ("--no-search", "search", False), ("--quiet", "quiet", True),
-        ("--note x", "note", "x"), ("--limit 3", "limit", 3), ("--width-mm 120", "width_mm", 120.0),
+        ("--note -x", "note", "-x"), ("--limit 3", "limit", 3), ("--width-mm 120", "width_mm", 120.0),
         ("", "power", 1), ("", "limit", None),
     ],
 )  # fmt: skip
@@ -75,19 +79,16 @@ def test_a_command_line(arguments: str, key: str, value: object) -> None:
 @pytest.mark.parametrize(
     ("arguments", "problem"),
     [
-        (["--tag-id", "x"], "--tag-id of run.py: tag_id must be a whole number"),
-        (["--tag", "3"], "--tag is no option of run.py: --tag-size-m, --tag-id, "),
-        (["--tag-id"], "--tag-id needs a value"),
-        (["--describe"], "--describe goes alone"),
-        (["--config"], "run.py: which robot? Add its config file, for example: --config goob.json (see --help)\n"),
-        (None, "run.py: --tag-size-m is missing (see --help)\n"),
+        (["--tag-id", "x"], "--tag-id: tag_id must be a whole number"),
+        (["--tag", "3"], "unrecognized arguments: --tag 3"),
+        (None, "run.py: the following arguments are required: --tag-size-m (see --help)\n"),
     ],
 )
 def test_a_wrong_command_line_is_one_line(
     arguments: list[str] | None, problem: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as exit_:
-        parse(Options, [], "run.py", "") if arguments is None else parsed(*arguments)
+        parse(Options, [], OneLineParser(prog="run.py")) if arguments is None else parsed(*arguments)
     assert exit_.value.code == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
@@ -128,17 +129,6 @@ def test_an_option_may_have_another_name_than_its_key() -> None:
     size, state = form(Renamed)
     assert (size.key, size.arg, size.required, size.default) == ("tag_size_m", "--marker-size", True, 0.25)
     assert (state.arg, state.arg_false) == ("--tuned", "--no-tuned")
-    config = ["--config", "goob.json"]
-    given, path = parse(Renamed, ["--marker-size", "0.5", *config, "--tuned"], "run.py", "")
-    assert (given.tag_size_m, given.use_state, path) == (0.5, True, Path("goob.json"))
-    assert parse(Renamed, config, "run.py", "")[0].tag_size_m == 0.25
-    by_key = parse(Renamed, [*config, "--tag-size-m=0.5", "--use-state"], "run.py", "")[0]
-    assert (by_key.tag_size_m, by_key.use_state) == (0.5, True)
-
-
-def test_help_lists_all_options(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit, match="0"):
-        parsed("--help")
-    options = [line.split("  ")[2] for line in capsys.readouterr().out.splitlines() if line.startswith("    ")]
-    assert options[:2] == ["--tag-size-m FLOAT", "--tag-id INT"]
-    assert options[-2:] == ["--config FILE", "--describe"]
+    given = parse(Renamed, ["--marker-size", "0.5", "--tuned"], OneLineParser(prog="run.py"))[0]
+    assert (given.tag_size_m, given.use_state) == (0.5, True)
+    assert parse(Renamed, [], OneLineParser(prog="run.py"))[0].tag_size_m == 0.25
