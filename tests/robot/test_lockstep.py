@@ -28,7 +28,12 @@ def test_no_schedule_violates_a_rule() -> None:
 
 @pytest.fixture(scope="module")
 def config(tmp_path_factory: pytest.TempPathFactory) -> Config:
-    return configuration(Path(tmp_path_factory.mktemp("own")))
+    return configuration(Path(tmp_path_factory.mktemp("own")), "free")
+
+
+@pytest.fixture(scope="module")
+def bridged(tmp_path_factory: pytest.TempPathFactory) -> Config:
+    return configuration(Path(tmp_path_factory.mktemp("own")), "free", bridged=True)
 
 
 def perform(config: Config, events: tuple[Any, ...]) -> TwoOwners:
@@ -53,7 +58,7 @@ def perform(config: Config, events: tuple[Any, ...]) -> TwoOwners:
         elif what == "retained":
             world.do_retain(1, -1)  # the newest turn, with a time of now
         else:
-            others = {"broker": world.outside, "bridge": world.bridge}
+            others = {"broker": world.outside, "bridge": world.bridge, FIRST: world.owners[FIRST].connection}
             getattr(others.get(who) or world.drivers[who], what)(*arguments, **fields)
     return world
 
@@ -131,9 +136,14 @@ SILENCE: dict[str, tuple[Any, ...]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", [*SILENCE, *MEMBERS])
+@pytest.mark.parametrize("name", SILENCE)
+def test_what_is_no_silence(bridged: Config, name: str) -> None:
+    perform(bridged, SILENCE[name])
+
+
+@pytest.mark.parametrize("name", MEMBERS)
 def test_who_drives_two_owners(config: Config, name: str) -> None:
-    perform(config, (SILENCE | MEMBERS)[name])
+    perform(config, MEMBERS[name])
 
 
 def test_the_second_shows_what_the_first_does_under_its_own_boot(config: Config) -> None:

@@ -68,7 +68,7 @@ class Process:
         self.alive = False
         self.frozen = False
         self.delay = 0.0  # of each message from or to it
-        self.connections: list[Connection] = []  # of this life
+        self.connection: Connection | None = None
         self.frozen_at = 0.0
         self._waiting: list[Callable[[], None]] = []
         self._turn_at: float | None = None
@@ -98,8 +98,8 @@ class Process:
         if not self.frozen:
             return
         self.frozen = False
-        for connection in self.connections:
-            connection.silent(self.scheduler.now - self.frozen_at)
+        if self.connection is not None:
+            self.connection.silent(self.scheduler.now - self.frozen_at)
         waiting, self._waiting = self._waiting, []
         for job in waiting:
             job()
@@ -110,8 +110,8 @@ class Process:
         """End, however: the kernel closes the connection."""
         self.alive = self.frozen = False
         self._waiting, self._turn_at = [], None
-        connections, self.connections = self.connections, []
-        for connection in connections:
+        connection, self.connection = self.connection, None
+        if connection is not None:
             connection.network.crash(connection)
 
     def turn(self) -> None:
@@ -207,7 +207,7 @@ class Connection(MemoryTransport):
         self.process, self.network = process, network
         self.number = 0  # of the connection
         self._away = False
-        process.connections.append(self)
+        process.connection = self
 
     def arrive(self, delivery: Any, number: int) -> None:
         if number != self.number or not self._present:

@@ -125,15 +125,15 @@ class MemoryFile:
 
     def save(self, value: Any) -> int:
         self._number += 1
-        number, life, written = self._number, self._process.connections, msgspec.json.encode(value)
+        number, life, written = self._number, self._process.connection, msgspec.json.encode(value)
 
         def write() -> None:
-            if self._process.connections is life:
+            if self._process.connection is life:
                 self._disk[self.path] = written
                 self._process.scheduler.after(_SAVED_S, lambda: self._process.do(saved))
 
         def saved() -> None:
-            if self._process.connections is life:
+            if self._process.connection is life:
                 self.busy = number < self._number
                 self._on_saved(number, True)
                 self._process.wake()
@@ -309,28 +309,46 @@ class Bridge(ServiceProcess):
 
     def __init__(self, inside: Network, outside: Outside, config: Config) -> None:
         super().__init__("bridge", inside.scheduler, lambda process: self._service(inside, outside, config))
+        self.remote: Remote | None = None
+        self.stops: Remote | None = None
+        self._local: Connection | None = None
 
     def _service(self, inside: Network, outside: Outside, config: Config) -> MqttBridge:
-        local, remote, stops = Connection(self, inside), Remote(self, outside), Remote(self, outside, of_stops=True)
+        self._local = Connection(self, inside)
+        remote, stops = Remote(self, outside), Remote(self, outside, of_stops=True)
+        self.remote, self.stops = remote, stops
         with (
             patch.object(bridge_module, "remote_transport", lambda *_arguments, **_options: remote),
             patch.object(bridge_module, "stops_transport", lambda _config: stops),
             patch.object(robot_audit, "Audit", Unwritten),
         ):
-            return MqttBridge(config, local, clock=self.scheduler.clock)
+            return MqttBridge(config, self._local, clock=self.scheduler.clock)
 
     @property
     def reaches_owners(self) -> bool:
         """True if it runs and has its connection to the robot."""
-        return self.alive and not self.frozen and self.connections[0]._present
+        return self.alive and not self.frozen and self._local is not None and self._local._present
+
+    @property
+    def _connections(self) -> list[Connection]:
+        return [one for one in (self._local, self.remote, self.stops) if one is not None]
+
+    def thaw(self) -> None:
+        frozen_s = self.scheduler.now - self.frozen_at
+        for connection in self._connections if self.frozen else ():
+            connection.silent(frozen_s)
+        super().thaw()
 
     def lose(self, seconds: float, *, local: bool) -> None:
         """Lose one of the two connections for so long."""
-        self.connections[0 if local else 1].lose(seconds)
+        connection = self._local if local else self.remote
+        assert connection is not None
+        connection.lose(seconds)
 
     def lose_stops(self, noticed_s: float, seconds: float) -> None:
         """Lose the connection of stops; that is noticed after a while, and it is made again."""
-        stops: Any = self.connections[2]
+        stops = self.stops
+        assert stops is not None
         stops.deaf = True
 
         def notice() -> None:
@@ -341,5 +359,10 @@ class Bridge(ServiceProcess):
 
     def find(self) -> None:
         """Find what was lost."""
-        for connection in self.connections:
+        for connection in self._connections:
             connection.find()
+
+    def leave(self) -> None:
+        super().leave()
+        for connection in self._connections:
+            connection.network.crash(connection)

@@ -148,7 +148,8 @@ class StopRules:
     def check(self) -> None:
         now, bridged = self._scheduler.now, self._bridge.reaches_owners
         for name, owner in self._owners.items():
-            if not (bridged and owner.alive and owner.connections[0]._present and not owner.frozen):
+            reached = owner.connection is not None and owner.connection._present and not owner.frozen
+            if not (bridged and owner.alive and reached):
                 self._reached_from[name] = now
             due = [at for at in (self._stopped[stop] for stop in self._first) if at > self._reset_sent[name]]
             state = self._published.get(name)
