@@ -65,6 +65,7 @@ class CmdVel:
         self._ends = False  # the thread is to end
         self._due = 0.0  # when the thread sends next; infinite: not before something changes
         self._log = RateLimitedLog(log)
+        self.held_back = 0  # moves that a hung base did not get
         self._out.first = lambda: ZERO
         if self._lock is not None:
             self._lock.first = self._first_lock
@@ -189,6 +190,7 @@ class CmdVel:
     def _send(self) -> None:
         """Send the command; a base that hangs gets zeros, so that it does not move when it goes on."""
         if self._body != ZERO and self.hangs:
+            self.held_back += 1
             self._log.warning("hangs", "the base sends no odometry: it gets zeros instead of commands")
             self._body, self._until = ZERO, 0.0
         self._out.send(self._body)

@@ -2,7 +2,7 @@
 
 The rule: motors only run as requested by a command that is fresh, not retained, and reached the board in the last
 second, and never while a stop is latched, also after a power cut. It is checked at every event, also while the firmware
-blocks.
+blocks. The motors are read from the pins and the bus, not from the simulated body.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
-from pebble.extensions.lab.simulation.i2c_devices import MotorShield
 from pebble.extensions.lab.simulation.micropython.board import Board
 from pebble.extensions.lab.simulation.micropython.clock import VirtualClock
 from pebble.extensions.lab.simulation.micropython.ports import OF_ROBOT
@@ -38,6 +37,22 @@ CONTROL, HOLDER = f"{BASE}/incoming/control", f"{BASE}/outgoing/control/mcu"
 
 _WRAP_MS = 1 << 30
 Outputs = tuple[float, ...]
+
+
+class Shield:
+    """BenJr's motor shield on the bus: the last message holds until the next one, as on the real one."""
+
+    def __init__(self) -> None:
+        self.speeds = [0.0, 0.0]
+
+    def write(self, data: bytes) -> None:
+        assert len(data) == 4, data
+        if data[0] in (0x10, 0x11):
+            duty = int.from_bytes(data[2:], "big") / 10_000
+            self.speeds[data[0] & 1] = {1: -duty, 2: duty}.get(data[1], 0.0)
+
+    def read(self, count: int) -> bytes:
+        return bytes(count)
 
 
 class WatchedClock(VirtualClock):
@@ -111,7 +126,7 @@ class Drill:
     def _boot(self) -> Any:
         pins = self.board.firmware.module(f"{self.kind}.pins")
         if self.kind == "benjr":
-            self._shield_address, self.shield = pins.MOTOR_SHIELD, MotorShield()
+            self._shield_address, self.shield = pins.MOTOR_SHIELD, Shield()
             self.board.bus.attach(self._shield_address, self.shield)
         self._pairs = [getattr(pins, name, None) for name in ("LEFT", "RIGHT", "GROUSERS")]
         host = self.random.choice(("10.0.0.2", "broker.test", "broker.local"))

@@ -287,7 +287,7 @@ class World:
             ("the uplink is cut", uplink.cut, uplink.mend, 1.0),
             ("a broker is away", broker.kill, broker.start, 1.5),
             ("a broker is frozen", broker.freeze, broker.thaw, 1.5),
-        )[b & 3]
+        )[b >> 3 & 3]
         with self._fault(which, after):
             begin()
             time.sleep(_FROZEN_S[b % len(_FROZEN_S)])
@@ -379,12 +379,16 @@ class World:
         time.sleep(_HOLD_S)
         return self._use_script(self.people[0])
 
-    def _drives(self, person: Person) -> str:
-        """Return why not; empty: it gets control and drives, while the other one sends keys of before."""
+    def _drives(self, person: Person, *, zero: bool = True) -> str:
+        """Return why not; empty: it gets control and drives, while the other one sends keys of before.
+
+        ``zero``: after a reset one lets go first; while a script drives, that would end it.
+        """
         person.request("control/take")
         if not until(person.has_control):
             return f"{person.name} does not get control"
-        person.drive(0)  # after a reset one lets go first
+        if zero:
+            person.drive(0)
         self._note("drives", person)
         began, wheels = time.monotonic(), (SPEEDS[person.name],) * 2
         for one in self.people:
@@ -402,13 +406,21 @@ class World:
                 break
         if not drives:
             return [f"a script does not drive: {self.rig.script()}"]
+        if problem := self._drives(person, zero=False):
+            return [problem]
+        released = time.monotonic()
+        person.drive(0)  # with its key: any other zero ends the script
+        person.request(want="release")
+        if not until(lambda: self._script_moves(released)):
+            return ["a script does not go on after a person has let go"]
         stopped = time.monotonic()
         self.do_let_go(person, 0)
         if not until(lambda: self.rig.mcu.drives(stopped) and not self.rig.mcu.moving(stopped)):
             return ["the wheels are not at rest after a person's stop"]
         if not until(lambda: not self.alive.groups):
             return ["a script that a person has stopped does not end"]
-        return []
+        shown = until(lambda: self.rig.script().get("error") == "stopped by an operator")
+        return [] if shown else [f"the status does not say why the script has ended: {self.rig.script()}"]
 
     def _script_moves(self, since: float) -> bool:
         return any(by_script(wheels) for _, wheels in self.rig.mcu.drives(since))

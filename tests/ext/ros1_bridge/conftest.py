@@ -18,7 +18,7 @@ from pebble.config import Config, parse
 from pebble.services.ros1_bridge.service import Ros1Bridge
 from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.kit.robot import Listener, Running
-from tests.support import ROOT, Child, free_port, listening, until
+from tests.support import Child, free_port, listening, until
 
 HERE = Path(__file__).parent
 NEEDED = "rosmaster, rospy, nav_msgs.msg, diagnostic_msgs.msg, actionlib_msgs.msg, geometry_msgs.msg, std_msgs.msg"
@@ -39,8 +39,7 @@ class World:
         self.port = free_port()
         self.uri = f"http://127.0.0.1:{self.port}"
         self.environment = {**os.environ, "ROS_MASTER_URI": self.uri, "ROS_IP": "127.0.0.1",
-                            "ROS_LOG_DIR": str(folder), "ROS_HOME": str(folder),
-                            "PYTHONPATH": str(ROOT) if partner == "scripted" else ""}  # fmt: skip
+                            "ROS_LOG_DIR": str(folder), "ROS_HOME": str(folder), "PYTHONPATH": ""}  # fmt: skip
         self.processes: dict[str, Child] = {}
 
     def start(self, name: str, *command: str) -> Child:

@@ -168,7 +168,10 @@ def test_what_cannot_confirm_a_stop_gets_it_or_zeros_for_a_minute(
     first = stop.tick(0.0)
     receive(stop, capabilities(GOOB, value), *robot.take(first), now=0.1)
     assert stop.due == 0.1, "its capabilities may name other topics"
-    assert [topics(first), topics(stop.tick(0.1)), topics(stop.tick(0.6))] == [[ESTOP, DRIVE], next_, later]
+    second = stop.tick(0.1)
+    assert [topics(first), topics(second), topics(stop.tick(0.6))] == [[ESTOP, DRIVE], next_, later]
+    ends = [message.payload for message in second if message.topic in (SCRIPT, "a/s")]
+    assert set(ends) <= {b'{"action":"stop"}'}
     assert stop.robots[GOOB].why == why
     assert sent_times(stop, 100.0)[-1] == pytest.approx(59.6)
     assert stop.robots[GOOB].progress is (Progress.OLD if why == OLD else Progress.NOT_CONFIRMED)
