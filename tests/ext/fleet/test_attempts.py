@@ -1,7 +1,4 @@
-"""What each account gets through at a real mosquitto, at both levels, with and without TLS.
-
-Expected by hand: what is changed here is to be changed in the table of roles in docs/ext/fleet.md, too.
-"""
+"""What each account gets through at a real mosquitto, at both levels, with and without TLS. Expected by hand."""
 
 from __future__ import annotations
 
@@ -19,7 +16,7 @@ from pebble.extensions.thin.expander import is_stream
 from pebble.transports.base import Message, QoS
 from pebble.transports.topics import matches
 from tests.ext.fleet.brokers import HOST, BrokerClient, FleetBroker, Place, RefusedError
-from tests.support import free_port, until
+from tests.support import ROOT, free_port, until
 
 GOOB, FRED, LAMP = "pebble/robots/goob", "pebble/robots/fred", "pebble/lamps/lamp"
 MARK = "pebble/gateways/eye/outgoing/online"
@@ -267,3 +264,69 @@ def test_every_role_and_every_command_of_the_contract_is_tried() -> None:
         matched for matched in given for metric in METRICS if matches(matched.filter(GOOB), f"{GOOB}/incoming/{metric}")
     }
     assert tried == given
+
+
+#: The rows of docs/ext/fleet.md: what is sent, below the robot or the system; ``{by}`` is the sender at level `named`.
+ROWS = {
+    "emergency stop, with or without a name": ["incoming/{by}estop", "incoming/estop"],
+    "drive, also by a will or a retained command": ["incoming/{by}drive-values", "incoming/{by}control"],
+    "drive, without a name": ["incoming/drive-values", "incoming/control"],
+    "scripts, lights, sounds, outlets, devices, voice; allow pictures and sound": [
+        f"incoming/{{by}}{one}"
+        for one in (
+            *("autonomy-command", "lights-solid", "lights-flash", "soundboard-command", "outlets/a/power"),
+            *("mcu/u1/led", "mip-raw", "audio", "audio-stream", "flags/mqtt-video", "flags/mqtt-audio"),
+        )
+    ],
+    "take control over": ["incoming/{by}control/take"],
+    "reset an emergency stop": ["incoming/{by}estop-reset"],
+    "ask for pictures": ["incoming/{by}front-camera"],
+    "reboot, restart, update, mirror": [
+        f"incoming/{{by}}flags/{one}" for one in ("reboot", "service-restart", "git-pull", "remote-mirror")
+    ],
+    "pose as this robot, or as others who command it; commands that the contract does not know": [
+        *(f"incoming/by/nobody/{one}" for one in ("drive-values", "control", "estop-reset")),
+        *("outgoing/online", "outgoing/control/serial", "outgoing/junk"),
+        *("incoming/{by}junk", "incoming/{by}flags/junk"),
+    ],
+    "pose as another or a new robot, or as a page server": [
+        *("pebble/robots/new/outgoing/online", "pebble/robots/new/incoming/junk"),
+        "pebble/servers/x1/outgoing/online",
+    ],
+    "probe a broker as a page server": ["pebble/servers/x1/outgoing/bridge-probe"],
+}
+SHOWN = {
+    "see what the robot publishes, and its flags": ["outgoing/online", "incoming/flags/x"],
+    "see commands of others": ["incoming/drive-values", "incoming/audio-stream", "incoming/by/otto/drive-values"],
+}
+COLUMNS = {
+    "viewer": "vera",
+    "driver": "otto",
+    "maintainer": "mia",
+    "safety": "sam",
+    "admin, page": "admin",
+    "the robot": "goob",
+}
+
+
+def test_the_table_of_the_documentation_is_what_the_brokers_do() -> None:
+    lines = (ROOT / "docs/ext/fleet.md").read_text().partition("| to a robot |")[2].partition("\n\n")[0].splitlines()
+    head, _, *rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    assert head == list(COLUMNS)
+    table = {what: dict(zip(COLUMNS, cells, strict=True)) for what, *cells in rows}
+    assert table == {what: {one: _cell(what, name) for one, name in COLUMNS.items()} for what in (*ROWS, *SHOWN)}
+    assert {what: _cell(what, "page-1") for what in table} == {what: row["admin, page"] for what, row in table.items()}
+    assert {_cell(what, "fred") for what in table} == {"–"}
+
+
+def _cell(what: str, name: str) -> str:
+    """One word, which is true for each topic of the row."""
+    answers = []
+    for level in LEVELS:
+        by = f"by/{name}/" if level == "named" else ""
+        topics = [one.format(by=by) for one in ROWS.get(what, SHOWN.get(what, ()))]
+        topics = [one if one.startswith("pebble/") else f"{GOOB}/{one}" for one in topics]
+        may = {lets_through(name, one, level) if what in ROWS else is_shown(name, one) for one in topics}
+        assert len(may) == 1, (what, name, level)
+        answers.append(may.pop())
+    return {(True, True): "yes", (True, False): "login", (False, True): "named", (False, False): "–"}[tuple(answers)]
