@@ -9,6 +9,7 @@ import threading
 import time
 from collections import defaultdict
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -99,6 +100,28 @@ def end(script: Any) -> str:
     script.send_signal(signal.SIGTERM)
     output: str = script.communicate(timeout=WAIT_S)[0]
     return output
+
+
+def test_a_follower_drives_towards_the_tag_and_stops(sensors: Sensors) -> None:
+    sensors.subscribe("apriltag-data", "video-overlays")
+    station = sensors.station
+    station.received.clear()
+    script = sensors.start("apriltag-follow", "--marker-size", "0.25")
+    data = sensors.messages["apriltag-data"]
+    assert until(lambda: sum(one["detected"] for one in data) > 20)
+    assert data[-1]["distance_m"] == pytest.approx(math.hypot(2.0, 0.3), rel=0.02)
+    assert data[-1]["angle_rad"] == pytest.approx(math.atan2(0.3, 2.0), abs=0.01)
+    driven = [one for one in station.received if one.drive.moves]
+    assert all(one.drive.z > 0.8 and one.drive.x > 0 for one in driven[5:]), "forward, and to the right"
+    gaps = sorted(after.at - before.at for before, after in pairwise(driven[5:20]))
+    assert gaps[len(gaps) // 2] > 0.05, "10 a second, or fewer on a busy machine"
+    sensors.visible = False
+    assert until(lambda: not data[-1]["detected"])
+    assert (data[-1]["corners_norm"], data[-1]["distance_m"]) == ([], None)
+    sensors.visible = True
+    end(script)
+    assert until(station.rests)
+    assert until(lambda: not data[-1]["detected"] and sensors.messages["video-overlays"][-1]["shapes"] == [])
 
 
 def test_odometry_measures_the_way_and_rests_at_a_lower_rate(sensors: Sensors) -> None:
