@@ -202,7 +202,7 @@ def test_a_server_without_an_account_stops_and_else_shows_why_it_may_do_nothing(
 
 
 METRICS = ("status", "wheel-odometry", "logs", "mcu/x/describe", "autonomy-status")
-ODD = (b"", b"\xff\xfe", b'{"value":NaN}', b'{"t":1e999}', b'{"value":"\\ud800"}', b"[" * 60_000, b"9" * 60_000)
+ODD = (b"", b"[" * 60_000, b"9" * 60_000, b"\xff\xfe", b'{"t":1e999}', b'{"value":"\\ud800"}', b'{"value":NaN}')
 
 
 def flood(port: int, messages: Iterable[tuple[str, bytes]]) -> None:
