@@ -64,13 +64,17 @@ _FLAGS = (
 
 
 @contextmanager
-def chromium() -> Iterator[Browser]:
-    """Run a headless browser. Skips the test without a Chromium, except where CI says it must be there."""
+def chromium(*flags: str) -> Iterator[Browser]:
+    """Run a headless browser with further ``flags``.
+
+    Skips the test without a Chromium, except where CI says it must be there.
+    """
     program = shutil.which("chromium")
     if program is None:
         reason = "no Chromium: apt install chromium, or `sh tools/debian-packages.sh chromium=chromium`"
         (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(reason)
-    with sync_playwright() as all_, closing(all_.chromium.launch(executable_path=program, args=_FLAGS)) as browser:
+    args = [*_FLAGS, *flags]
+    with sync_playwright() as all_, closing(all_.chromium.launch(executable_path=program, args=args)) as browser:
         yield browser
 
 

@@ -303,6 +303,18 @@ def with_stream(address: str) -> Callable[[int], Value]:
     return lambda now: (GOOB, "status", {"t": now, "value": {"webrtc_url": address}}, 100)
 
 
+NO_BOARD = "cannot open /dev/ttyACM0: No such file or directory"
+#: Of goob the motor board is unplugged; of fred it is silent, perhaps by design.
+_BOARDS = {
+    "serial": {"state": "absent", "why": NO_BOARD},
+    "imu": {"state": "ready", "heard_ms": 0},
+    "relays": {"state": "silent", "heard_ms": 10_000},
+}
+UNDRIVEABLE = (
+    at(GOOB, "status", services(mcu=_BOARDS, driveable={"state": "no", "why": f"serial: {NO_BOARD}"})),
+    at(FRED, "status", services(driveable={"state": "unknown", "why": "serial: its board has sent nothing yet"})),
+)
+
 #: The server has recordings.
 REPLAYING = State("/replay?days", fleet, LIVE, {"recordings": True}, recordings=True)
 
@@ -314,6 +326,8 @@ NO_BROKER = {
     "robots_omitted": 0,
     "stops_omitted": False,
 }
+NOT_RECEIVED = "messages come from only 1 of 2 brokers: broker spare.lab:8884 refused us: not authorized"
+ONE_BROKER = NO_BROKER | {"connected": True, "problem": "", "not_received": NOT_RECEIVED}
 UNCONFIRMED = "base has not confirmed it"
 BOB_DRIVES = at(GOOB, "web/driver", driver("bob", "phone", keeps=False))
 
@@ -334,6 +348,7 @@ def of(path: str, *changes: Callable[[int], Value], base: Values = fleet, **more
 STATES: dict[str, State] = {
     "fleet": of("/", BOB_DRIVES),
     "fleet-stopped": of("/", stopped(GOOB, "eve on phone"), stopped(FRED, "eve on phone", why="button, all")),
+    "fleet-undriveable": of("/", *UNDRIVEABLE),
     "fleet-thousand": State("/", thousand),
     "fleet-empty": State("/", lambda _now: []),
     "fleet-lost": State("/", fleet, silent=True),
@@ -350,6 +365,7 @@ STATES: dict[str, State] = {
     "kept": of(GOOB_PATH, keeping(by="bob", device="phone"), welcome=MAY_TAKE),
     "kept-and-asked": of(GOOB_PATH, keeping(by="bob", device="phone", asking=True, others=True), welcome=MAY_TAKE),
     "others-ask": of(GOOB_PATH, keeping(by="alice", you=True, asks="otto")),
+    "others-drive": of(GOOB_PATH, keeping(by="alice", you=True, others=True)),
     "viewer": of(GOOB_PATH, welcome=VIEWER),
     "stopped": of(GOOB_PATH, MINE, *EVE_STOPPED),
     "stop-sent": of(GOOB_PATH, MINE, stopped(GOOB, "", sending="sent", text=UNCONFIRMED)),
@@ -359,6 +375,7 @@ STATES: dict[str, State] = {
     ),
     "lost": State(GOOB_PATH, changed(fleet, MINE), silent=True, freezes=True),
     "no-broker": of(GOOB_PATH, MINE, at("", "web/broker", NO_BROKER)),
+    "one-broker": of(GOOB_PATH, MINE, at("", "web/broker", ONE_BROKER)),
     "silent": of(GOOB_PATH, MINE, SILENT, repeated={}, pictures=False),
     "old-picture": replace(DRIVING, freezes=True),
     "no-picture": of(GOOB_PATH, MINE, at(GOOB, "web/picture", flow("starting")), logs=logs, pictures=False),

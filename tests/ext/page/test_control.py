@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import itertools
 import secrets
+import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -20,6 +21,7 @@ from pebble.extensions.media.video import make_encoder
 from pebble.transports import MqttSettings, QoS, create
 from tests.ext.page.attacker import Hall
 from tests.ext.page.served import Page, Served
+from tests.kit import mqtt_bytes
 from tests.kit.played_robot import RecordingRobot
 from tests.support import SOON_S, Broker, beside, until
 from tests.tcp_proxy import SlowTcpProxy, TcpProxy
@@ -194,6 +196,45 @@ def test_a_server_without_an_account_stops_and_else_shows_why_it_may_do_nothing(
         page.send("estop", ref=ref, stop="00c0ffee00c0ffee", why="")
         assert until(lambda: page.value(ref, "web/estop", "sending") == "confirmed")
         assert named.wire == {f"{ref}/incoming/drive-values", f"{ref}/incoming/estop"}
+
+
+# -- an attacker at the broker
+
+
+METRICS = ("status", "wheel-odometry", "logs", "mcu/x/describe", "autonomy-status")
+ODD = (b"", b"[" * 60_000, b"9" * 60_000, b"\xff\xfe", b'{"t":1e999}', b'{"value":"\\ud800"}', b'{"value":NaN}')
+
+
+def flood(port: int, messages: Iterable[tuple[str, bytes]]) -> None:
+    """Publish everything with QoS 0, as fast as the broker takes it."""
+    with socket.create_connection(("127.0.0.1", port), 30) as client:
+        client.sendall(mqtt_bytes.connect(None, None))
+        assert client.recv(4) == b"\x20\x02\x00\x00"
+        for topic, payload in messages:
+            client.sendall(mqtt_bytes.publish(topic, payload))
+        client.sendall(mqtt_bytes.packet(0xC0, b""))
+        assert client.recv(2) == b"\xd0\x00", "the broker has taken everything"
+
+
+def test_large_and_odd_values_keep_no_page_from_driving(
+    broker: Broker, page: Page, robot: RecordingRobot, caplog: pytest.LogCaptureFixture
+) -> None:
+    page.send("watch", ref=robot.base)
+    sizes = (10, 60_000, 70_000, 1_000_000)
+    large = (
+        (f"pebble/robots/z{number}/outgoing/{metric}", b'{"value":"' + b"x" * sizes[number % 4] + b'"}')
+        for number in range(200)
+        for metric in ("status", "capabilities")
+    )
+    flood(broker.port, large)
+    flood(broker.port, ((f"{robot.base}/outgoing/{metric}", payload) for payload in ODD for metric in METRICS))
+    robot.publish("status", {"value": {"last": 1}})
+    assert until(lambda: page.value(robot.base, "status", "value") == {"last": 1}), "what pages get is no JSON"
+    assert until(lambda: page.moves(robot))
+    page.send("stop", ref=robot.base)
+    assert until(lambda: robot.drives()[-1]["z"] == 0)
+    assert not page.closed, page.bye
+    assert [record for record in caplog.records if record.exc_info] == []
 
 
 # -- pictures over a slow connection

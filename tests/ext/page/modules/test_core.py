@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from pebble.extensions.operator.client.drive_reasons import WORDS
-from tests.ext.page.in_node import Rows, Script, evaluate, rows
+from tests.ext.page.in_node import STATIC, Rows, Script, evaluate, rows
 
 # -- gestures: what is sent is listed as [gesture, sum of the axes, final]; all but z are 0
 
@@ -82,6 +82,11 @@ inputs = Script({"core/inputs.js": "Inputs, balanced"}, _INPUTS)
 KEYS = {
     "KeyW": [0, 1, 0],
     "KeyA": [-1, 0, 0],
+    "KeyD": [1, 0, 0],
+    "ArrowUp": [0, 1, 0],
+    "ArrowDown": [0, -1, 0],
+    "ArrowLeft": [-1, 0, 0],
+    "ArrowRight": [1, 0, 0],
     "KeyW KeyS": [0, 0, 0],
     "KeyW KeyD": [0.5, 0.5, 0],
     "KeyE": [0, 0, -1],
@@ -362,9 +367,62 @@ MAPPING: Rows = {
 # fmt: on
 
 
+# -- what is joined to the page later; ``later`` runs what it does each second
+
+_MORE = """
+const define = (name, value) => Object.defineProperty(globalThis, name, { value, configurable: true });
+let dialog = null;
+let later;
+const seen = [];
+define("location", { search: "" });
+define("document", {
+  querySelector: () => dialog, createElement: () => ({}), head: { append() {} }, addEventListener() {},
+  documentElement: { toggleAttribute() {} },
+});
+const lock = { released: false, release() { seen.push("off"); this.released = true; } };
+const request = async () => (seen.push("on"), Object.assign(lock, { released: false }));
+define("navigator", { wakeLock: { request } });
+define("setInterval", (run) => (later = run));
+define("fetch", async () => seen.push("reload"));
+const driver = { ref: "pebble/robots/goob", lease: {}, sliders: { speed: 0.5 }, changed() {}, onChange() {} };
+const panels = { toggle: (name) => seen.push(name) };
+const connection = { isOpen: true, show() {}, socket: { send: () => false } };
+const page = { driver, connection, store: { get: () => undefined }, panels, commands: {} };
+const key = (code, key = code) => driver.actions.keyDown({ code, key, repeat: false });
+const turn = () => new Promise((resolve) => setImmediate(resolve));
+"""
+_INSTALL = f"""
+const {{ install }} = await import("{(STATIC / "ui" / "more.js").as_uri()}");
+install(page);
+page.sound.model = {{ toggleMute: () => seen.push("mute") }};
+"""
+
+
+more = Script({}, _MORE + _INSTALL, "await turn();\nresult = seen;")
+
+
+# fmt: off
+MORE: Rows = {
+    "behind an open panel there is only the help":
+        ('key("KeyM"); dialog = {}; key("KeyM"); key("Slash", "?");', ["mute", "help"]),
+    "the screen stays on while this page has control": ("""
+        let you = false; page.store.get = () => ({ value: { you } });
+        for (you of [false, true, true, false, false, true]) { later(); await turn(); }
+        lock.released = true; later();""", ["on", "off", "on", "on"]),
+    "keys change the speed": ("""
+        for (const [code, times] of [["NumpadAdd", 1], ["NumpadAdd", 9], ["Minus", 1], ["Minus", 9]]) {
+          for (let n = 0; n < times; n++) key(code, code === "Minus" ? "-" : "+");
+          await turn(); seen.push(driver.sliders.speed);
+        }""", [0.6, 1, 0.9, 0.05]),
+    "a page that a person uses is not loaded anew by itself": (
+        "connection.isOld = true; for (const now of [1e6, 2e6]) { performance.now = () => now; later(); }", []),
+}
+# fmt: on
+
+
 @rows(
     (gesture, GESTURE), (inputs, INPUTS), (reasons, REASONS), (actions, ACTIONS), (denying, DENYING),
-    (mapping, MAPPING),
+    (mapping, MAPPING), (more, MORE),
 )  # fmt: skip
 def test_each(found: Callable[[], Any], expected: Any) -> None:
     assert found() == expected
