@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import signal
+import socket
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -28,7 +29,7 @@ from pebble.launcher.sd_notify import SystemdNotifier
 from pebble.runtime import notes
 from pebble.runtime.notes import Held, Wanted
 from tests.launcher.conftest import CONNECTION, DEVICE, Launch, Robot, Row
-from tests.support import gone, refused, until
+from tests.support import WAIT_S, gone, refused, until
 
 
 def crash(policy: RestartPolicy, at: float, ran_for: float = 0.0) -> float:
@@ -419,3 +420,12 @@ class StandIn:
     def hold(self) -> None:
         self.release()
         self.held = True
+
+
+def test_systemd_is_told_also_at_an_abstract_address() -> None:
+    name = f"pebble-{os.getpid()}"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(f"\0{name}")
+        systemd.settimeout(WAIT_S)
+        SystemdNotifier({"NOTIFY_SOCKET": f"@{name}"}).ready()
+        assert systemd.recv(64) == b"READY=1"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import ssl
 import threading
+import tracemalloc
 from collections.abc import Callable
 from contextlib import suppress
 from importlib.metadata import EntryPoint, EntryPoints
@@ -15,6 +16,7 @@ import pytest
 from pebble.errors import TransportError
 from pebble.transports import GROUP, Message, QoS, State, base, create, own_retained
 from pebble.transports.ages import MessageAges
+from pebble.transports.base import Subscriptions
 from pebble.transports.bounds import BoundedQueue, BoundedTable
 from pebble.transports.counters import Counters
 from pebble.transports.credentials import make_context
@@ -22,6 +24,8 @@ from pebble.transports.memory import MemoryHub, MemoryTransport
 from pebble.transports.own_retained import OwnRetained
 from pebble.transports.renewed import Renewed
 from pebble.transports.settings import TlsSettings
+from pebble.transports.topics import check_topic
+from pebble.transports.zenoh.keymap import key_to_topic, topic_to_key
 from tests.support import ROOT, WAIT_S, until
 
 
@@ -40,6 +44,19 @@ def test_retained_messages_are_bounded_and_those_that_were_known_first_are_sent_
     assert counters["forgotten"] == 4
     own.send_again({"b"}, lambda message: bool(again.append((message.topic, len(message.payload)))) or True)
     assert again == [("x", 0), ("d", 500)]
+
+
+def test_long_topics_of_strangers_are_not_remembered() -> None:
+    with MemoryTransport("client", MemoryHub()) as client:
+        subscriptions, wanted = Subscriptions(), client.subscribe("a/#", lambda _: None)
+        subscriptions.add(wanted)
+        tracemalloc.start()
+        for number in range(1000):
+            assert subscriptions.matching(f"a/{number:60000}") == (wanted,)
+            assert key_to_topic(topic_to_key(check_topic(f"a/{number:1000}"))) == f"a/{number:1000}"
+        left, _ = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+    assert left < 500_000
 
 
 def test_a_slow_handlers_queue_is_bounded_in_bytes(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import itertools
 import random
+import tracemalloc
 
 import pytest
 import zenoh
 from paho.mqtt.client import topic_matches_sub
 
 from pebble.transports import Message, QoS
+from pebble.transports.mqtt import filters
 from pebble.transports.mqtt.filters import BrokerFilters, OwnMessageFilter, overlap
 from pebble.transports.mqtt.outgoing import BACKLOG_BYTES, BACKLOG_MESSAGES, Backlog, InFlightTable, PendingAck
 from pebble.transports.mqtt.read_age import BrokerDelay, WaitingTime
@@ -379,3 +381,18 @@ def test_no_topic_maps_to_the_hubs_own_keys() -> None:
     for filter_ in ("#", "+/#", "@retain/#", "+/+", "@hub/hello"):
         assert not zenoh.KeyExpr(filter_to_key(filter_)).intersects(zenoh.KeyExpr("@retain/a"))
         assert not zenoh.KeyExpr(filter_to_key(filter_)).intersects(zenoh.KeyExpr("@hub/hello"))
+
+
+def test_large_payloads_and_many_topics_take_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(filters, "_LIMIT", 20)
+    own_filter = OwnMessageFilter()
+    tracemalloc.start()
+    for number in range(50):
+        message = retained(f"flag{number}", bytes(100_000))
+        own_filter.note_own(message)
+        own_filter.is_repeat(message)
+    used, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert used < 500_000
+    assert own_filter.is_echo(retained("flag49", bytes(100_000)))
+    assert not own_filter.is_echo(retained("flag0", bytes(100_000)))

@@ -8,9 +8,11 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.reasoncodes import ReasonCode
 
 from pebble.transports.base import Message, QoS
-from pebble.transports.mqtt import packets
+from pebble.transports.mqtt import packets, reasons
 from pebble.transports.mqtt.client import SendQuota
 from pebble.transports.mqtt.client_ids import unique
 from pebble.transports.mqtt.packets import ANY_QOS, MAX_PACKET, RETAIN, Accepted, Filter, MalformedError, Reader
@@ -61,6 +63,8 @@ def publish(topic: str, qos: int, *, modern: bool, retain: bool = False, expires
 
 
 LOGIN = {"username": "u", "password": "p\xe4", "will": Message("a/\xfc", b"\xff!", QoS.DELIVERED, True)}
+#: Each with another of its options.
+ONE_OPTION = [Filter("a", 1, no_local=True), Filter("a", 1, as_published=True), Filter("a", 1, sends_retained=False)]
 FILTERS = [Filter("a/#", 1, no_local=True, as_published=True, sends_retained=False), Filter("b", 0)]
 #: What is written, as MQTT's chapter 3 has it: 3.1.1 and 5.
 WRITTEN = [
@@ -82,6 +86,7 @@ WRITTEN = [
     (publish("a" * 20_000, 0, modern=False)[:5], "30a39c01 4e"),
     (packets.subscribe(258, FILTERS, modern=False), "820c 0102 0003 612f23 01 0001 62 00"),
     (packets.subscribe(258, FILTERS, modern=True), "820d 0102 00 0003 612f23 2d 0001 62 00"),
+    (packets.subscribe(258, ONE_OPTION, modern=True), "820f 0102 00 0001 61 05 0001 61 09 0001 61 21"),
     (packets.unsubscribe(258, ["a/#", "b"], modern=False), "a20a 0102 0003 612f23 0001 62"),
     (packets.unsubscribe(258, ["a/#", "b"], modern=True), "a20b 0102 00 0003 612f23 0001 62"),
 ]
@@ -255,3 +260,10 @@ def test_an_id_has_letters_digits_and_two_signs(name: str, begins: str) -> None:
     assert first.startswith(begins)
     assert first[:-16] == second[:-16]
     assert first != second
+
+
+def test_reasons_are_called_as_paho_calls_them() -> None:
+    for code in range(0x80, 0xA3):
+        name = ReasonCode(PacketTypes.DISCONNECT, identifier=0x80).names.get(code)
+        if name is not None:
+            assert reasons.words(code).lower() == next(iter(name)).lower()

@@ -21,6 +21,7 @@ from pebble.forwarding.routing import Drop, Side
 from pebble.forwarding.service import ForwardingService
 from pebble.forwarding.side import Gate
 from pebble.runtime.connections import local_transport
+from pebble.services.mqtt_bridge.requests.media import Media
 from pebble.transports import MqttSettings, State, Transport, ZenohSettings, create
 from tests.forwarding.virtual import SERVICES
 from tests.services.mqtt_bridge.bridge_rig import Client, Quiet, Running, make_config
@@ -56,8 +57,9 @@ class ZenohEnd:
 
     section: dict[str, Any]  # of a config
 
-    def __init__(self, folder: Path, *, uplink: bool = False) -> None:
-        self._hub = HubProcess(folder / ("uplink" if uplink else "run"))
+    def __init__(self, folder: Path, *, keeps: bool = False, uplink: bool = False) -> None:
+        self._journal = folder / "journal" if keeps else None
+        self._hub = HubProcess(folder / ("uplink" if uplink else "run"), self._journal)
         # a machine that stands still for the usual two seconds would make live messages late, and they would be dropped
         settings = replace(self._hub.settings, lease_ms=5000)
         if uplink:
@@ -72,6 +74,18 @@ class ZenohEnd:
 
     def transport(self, name: str) -> Transport:
         return create("zenoh", name, self._settings)
+
+    def save(self) -> None:
+        assert self._journal is not None
+        self._hub.wait_until_stored()
+        self._saved = self._journal.read_bytes()
+
+    def restore(self) -> None:
+        """Kill it, and start it with what was there at the last :meth:`save`."""
+        assert self._journal is not None
+        self._hub.kill()
+        self._journal.write_bytes(self._saved)
+        self._hub.start()
 
     def close(self) -> None:
         self._hub.end()
@@ -294,3 +308,30 @@ def test_stops_flags_and_commands_arrive_and_come_to_rest_without_bridge_mode(ma
     assert (rig.remote.payloads(VIDEO_FLAG)[-1], rig.local.payloads(AUDIO_FLAG)[-1]) == (FALSE, TRUE)
     too_late = rig.service.forwarder.counters[f"remote: {Drop.LATE.value}"]  # on a busy machine, behind the flags
     assert len(rig.local.on("incoming/flags/git-pull")) + too_late == 1
+
+
+def test_a_microphone_that_was_switched_off_stays_off_when_a_side_is_restored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: Make
+) -> None:
+    """A program that lives no more switched it on, an operator off after the save, and then the robot was off."""
+    allowed = list[bool]()
+    monkeypatch.setattr(Media, "allow", lambda _media, _flag, on: allowed.append(on))
+    end = ZenohEnd(tmp_path, keeps=True)
+    rig = make("bridge", end, MqttEnd(tmp_path))
+    rig.start()
+
+    def set_microphone(setter: Client, value: bytes, *others: Client) -> None:
+        setter.publish(AUDIO_FLAG, value, retain=True, remember=False)
+        assert until(lambda: all(client.payloads(AUDIO_FLAG)[-1:] == [value] for client in others))
+        assert until(lambda: rig.service.forwarder.retained.value(f"{rig.base}/{AUDIO_FLAG}") == value)
+
+    set_microphone(rig.client(LOCAL), TRUE, rig.local, rig.remote)
+    end.save()
+    set_microphone(rig.remote, FALSE, rig.local)
+    assert until(lambda: allowed[-1:] == [False])
+    rig.close()
+    allowed.clear()
+    end.restore()
+    rig.start()
+    assert until(lambda: {rig.retained(side).get(AUDIO_FLAG) for side in Side} == {FALSE})
+    assert True not in allowed

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import signal
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -199,3 +200,21 @@ def test_a_stop_goes_both_ways_and_a_reset_by_name(broker: Broker, robot: Record
     assert "takes commands only with a name" in run.err
     assert run("estop", "reset", name, "--url", url) == 0, run.err
     assert {one for one in incoming(robot) if one.endswith("reset")} == {"by/ann/estop-reset"}
+
+
+def test_a_password_comes_from_a_file_or_the_environment(
+    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    passwords = tmp_path / "passwords"
+    subprocess.run(["mosquitto_passwd", "-b", "-c", str(passwords), "ann", "geheim"], check=True, capture_output=True)
+    passwords.chmod(0o644)
+    broker = Broker(tmp_path, "allow_anonymous false", f"password_file {passwords}")
+    (tmp_path / "right").write_text("geheim\n")
+    url = f"mqtt://ann@127.0.0.1:{broker.port}"
+    pub = ("topic", "pub", "status", "{}", "--robot", "goob", "--url", url)
+    try:
+        assert run(*pub, "--password-file", tmp_path / "right") == 0
+        monkeypatch.setenv("PEBBLE_PASSWORD", "geheim")
+        assert run(*pub) == 0
+    finally:
+        broker.stop()
