@@ -267,7 +267,7 @@ def test_a_clip_is_repeated(board: Soundboard) -> None:
 )
 def test_a_loudspeaker_that_talk_back_has_is_busy(make: Make, doing: str, error: str) -> None:
     """Its player fails at once, which one in Python does not on a busy machine."""
-    board = make(player_command=["sh", "-c", "exit 1"], clip=0.1)
+    board = make(player_command=["sh", "-c", "exit 1"]).with_clip("a.wav", 0.1)
     report = codec.encode(MEDIA_REPORT, MediaReport(running=True, doing=doing))
     board.world.transport.publish(f"{board.world.base}/outgoing/media-report/audio_receiver", report, qos=QoS.DELIVERED)
     board.play("a.wav")

@@ -78,13 +78,16 @@ class ZenohEnd:
     def save(self) -> None:
         assert self._journal is not None
         self._hub.wait_until_stored()
-        self._saved = self._journal.read_bytes()
+        self._saved = {file: file.read_bytes() for file in self._journal.parent.glob("journal*")}  # its log too
 
     def restore(self) -> None:
         """Kill it, and start it with what was there at the last :meth:`save`."""
         assert self._journal is not None
         self._hub.kill()
-        self._journal.write_bytes(self._saved)
+        for file in self._journal.parent.glob("journal*"):
+            file.unlink()
+        for file, data in self._saved.items():
+            file.write_bytes(data)
         self._hub.start()
 
     def close(self) -> None:
@@ -332,6 +335,7 @@ def test_a_microphone_that_was_switched_off_stays_off_when_a_side_is_restored(
     rig.close()
     allowed.clear()
     end.restore()
+    assert until(lambda: rig.retained(LOCAL).get(AUDIO_FLAG) == TRUE), "it has not gone back"
     rig.start()
     assert until(lambda: {rig.retained(side).get(AUDIO_FLAG) for side in Side} == {FALSE})
     assert True not in allowed
