@@ -161,7 +161,7 @@ def test_silence_stops_the_wheels(station: Station) -> None:
     assert until(lambda: not station.rig.mcu.moving(began))
     started, _ = first_motion(station, began)
     stopped, _ = next((at, wheels) for at, wheels in station.rig.mcu.drives(started) if wheels == STOP)
-    assert stopped - started >= 0.70
+    assert stopped - began >= 0.75, "a line may be read late on a busy machine"
     assert stopped - started - lost_s(watch.found, started, stopped) < 1.0, "later the MCU stops by itself"
 
 
