@@ -96,7 +96,7 @@ class Safety(Section, frozen=True, kw_only=True):
 
 
 class Metric(Section, frozen=True, kw_only=True):
-    """One metric."""
+    """A metric that the base publishes."""
 
     retired: ClassVar = BY_CONTRACT
 

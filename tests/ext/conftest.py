@@ -1,4 +1,4 @@
-"""What surrounds a program under test: two brokers, or a local transport with MCUs on serial lines."""
+"""Surroundings of a program under test: two brokers, or a local transport with MCUs on serial lines."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def remote(tmp_path: Path) -> Iterator[Broker]:
 
 @pytest.fixture(scope="session", params=["memory", "mqtt", "zenoh"])
 def network(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LocalNetwork]:
-    """One broker, and one hub, for all robots of a run."""
+    """Make a broker or a hub for all robots of a run."""
     network = LocalNetwork(request.param, tmp_path_factory.mktemp("network"))
     yield network
     network.close()

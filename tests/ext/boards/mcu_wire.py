@@ -1,4 +1,4 @@
-"""What an MCU sends by pebble_serial_v1, written from the protocol's description, independently of the host's code."""
+"""Frames of an MCU by pebble_serial_v1, written from the protocol's description, independently of the host's code."""
 
 from __future__ import annotations
 

@@ -333,7 +333,7 @@ class Publish:
 
 
 class Body:
-    """What is left of a packet's body."""
+    """The rest of a packet's body."""
 
     def __init__(self, data: bytes) -> None:
         self.left = data
@@ -392,7 +392,7 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """What a client published."""
+    """A message that a client published."""
 
     at: float
     message: Publish
