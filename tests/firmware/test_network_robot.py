@@ -321,11 +321,12 @@ def test_a_fleet_takes_turns_of_kinds_shows_its_status_and_ends_in_order(start: 
     with closing(Operator(broker.port, "pebble/robots")) as operator:
         program = start("fleet", f"mqtt://127.0.0.1:{broker.port}", "-n", "3")
         assert until(lambda: "3 robots: connected" in log.read_text()), log.read_text()
+        robots = {"minilamp-001", "benjr-001", "minilamp-002"}
+        assert until(lambda: robots <= {message.topic.split("/")[2] for message in operator.seen})
     program.terminate()
     with quickly():
         assert program.wait(WAIT_S) == 0
     assert "3 of 3 online" in log.read_text()
-    assert {"minilamp-001", "benjr-001", "minilamp-002"} <= {one.topic.split("/")[2] for one in operator.seen}
     assert "Traceback" not in log.read_text()
 
 
