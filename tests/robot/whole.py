@@ -36,7 +36,10 @@ _STOP_TIMEOUT_S = 1.5
 _PERIOD_S = 0.06
 _HOLD_S = 2.2  # a person's command holds a script
 #: Faults of what the watcher hears the robot through.
-_DEAFENING = ("kill mqtt_mirror", "freeze mqtt_mirror", "kill zenoh_hub", "freeze zenoh_hub", "a broker is away")
+_DEAFENING = (  # a killed launcher takes hub and mirror along, as a power cut does
+    *("kill mqtt_mirror", "freeze mqtt_mirror", "kill zenoh_hub", "freeze zenoh_hub"),
+    *("kill launcher", "kill power", "a broker is away"),
+)
 _WAITS_S = (0.02, 0.05, 0.1, 0.1, 0.2, 0.3, 0.5, 1.0)
 _FROZEN_S = (0.1, 0.3, 0.5, 1.0, 1.5, 2.5)
 _FAULTS = (
