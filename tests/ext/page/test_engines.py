@@ -285,8 +285,10 @@ def _list(engine: Engine) -> None:
 
 
 def _dialog(engine: Engine) -> None:
-    engine.click("[data-test=settings]")
-    assert engine.until("document.querySelector('dialog[open]')")
+    """Open the settings, if they are not open yet: a click beside an open dialog would close it."""
+    if not engine.until("document.querySelector('dialog[open]')", 1):
+        engine.click("[data-test=settings]")
+        assert engine.until("document.querySelector('dialog[open]')")
 
 
 WHERE: dict[str, Callable[[Engine], object]] = {
