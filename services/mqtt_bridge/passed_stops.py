@@ -70,9 +70,13 @@ class Owner:
         enough = (state.boot, self._expected) if nameless and state is not None else None
         self.pending = Pending(stop, first, now, enough)
 
+    def has_had(self, name: str) -> bool:
+        """True if the owner's newest state names this stop."""
+        return self.state is not None and name in self.state.recent
+
     def confirms(self, name: str) -> bool:
         """True if the owner's newest state names this stop, except while a latched owner still has to save it."""
-        return self.state is not None and name in self.state.recent and _is_saved(self.state)
+        return self.state is not None and self.has_had(name) and _is_saved(self.state)
 
     def follow(self, state: EstopState | None, now: float) -> None:
         """Note the owner's newest state; None: the owner has withdrawn it."""
@@ -123,6 +127,7 @@ class PassedStops:
         stop = codec.decode(ESTOP, payload)
         now, name = self._clock(), str(stop.stop)
         with self._lock:
+            is_copy = name in self._passed
             first = self._passed.setdefault(name, now)
             if len(self._passed) > NAMES:
                 del self._passed[next(iter(self._passed))]
@@ -130,9 +135,10 @@ class PassedStops:
             reset_since = {key for key, owner in self._owners.items() if owner.freed_at > first} - waiting
             if reset_since:  # this repeats a stop that a reset has ended there: only the other owners get a copy
                 return [_encoded(stop, owner=key) for key in self._owners if key not in reset_since]
-            for key, owner in self._owners.items():  # of each owner the newest stop stays pending
-                has_newer = owner.pending is not None and owner.pending.first > first
-                if key not in waiting and not has_newer and not owner.confirms(name):
+            for key, owner in self._owners.items():  # the newest stop stays pending, also if an older one comes again
+                pending = owner.pending
+                is_older = pending is not None and (owner.has_had(name) or (is_copy and pending.first >= first))
+                if key not in waiting and not is_older and not owner.confirms(name):
                     owner.expect(stop, first, now, nameless=nameless)
         return [payload]
 

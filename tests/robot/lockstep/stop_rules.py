@@ -2,10 +2,11 @@
 
 * A stop that the bridge has passed on latches each owner that runs and is reached, unless a reset that was sent later
   ended it, also if a copy of it comes after the reset. Excused: what a killed bridge forgets.
-* A stop with a name passes to all owners as often as it came, and one without a name once, except around a loss of the
-  connection of stops, where equal bytes cannot be told apart.
+* A stop with a name passes to all owners as often as it came, and one without a name once, except around a loss of a
+  connection to the operators, where equal bytes cannot be told apart.
 * An owner that has shown that a stop was reset gets no copy of it. Excused: what a killed bridge forgets. To an owner
   that has forgotten a stop, a copy that passed before its reset was known is a new stop.
+* A stop of the robot's own side reaches its owners without the bridge, which repeats it to those that do not show it.
 * What is repeated is the newest stop that its owner has not shown, names its owner, and ends when that has withdrawn
   its emergency stop; in the end nothing is repeated, and a new stop stops every owner.
 """
@@ -37,7 +38,7 @@ class StopRules:
         self._topics = {ESTOP_STATE.topic(BASE, owner=name): name for name in owners}
         self._nameless = 0  # that were pressed
         self._invented: set[str] = set()  # names that the bridge has given them
-        self.doubtful = False  # the connection of stops was lost
+        self.doubtful = False  # a connection to the operators was lost
         self._published: dict[str, EstopState] = {}  # by owner, the newest state
         self._resets: dict[tuple[str, int], float] = {}  # by boot and count: when the newest was sent
         self._reset_sent = dict.fromkeys(owners, 0.0)  # when the newest reset was sent that an owner has obeyed
@@ -57,6 +58,8 @@ class StopRules:
         self._shown: set[tuple[str, str]] = set()  # (owner, name)
         self._over: set[tuple[str, str]] = set()  # the same, and it was reset since
         self._withdrawn: dict[str, float] = {}
+        self._unnamed_at: float | None = None  # when the bridge had the newest stop without a name
+        self._counted: set[str] = set()  # names of such stops, which an owner confirms by its count
 
     # -- what happens
 
@@ -73,12 +76,22 @@ class StopRules:
         if message.topic == _STOP and message.payload.strip() and not message.retain:
             stop = codec.decode(ESTOP, message.payload).stop
             self._came_at[str(stop)] = self._scheduler.now
-            if stop is not UNSET:
+            if stop is UNSET:
+                self._unnamed_at = self._scheduler.now
+            else:
                 self._came[str(stop)] += 1
                 self._came_first.setdefault(str(stop), self._scheduler.now)
 
     def learns(self, message: Message) -> None:
         """The bridge has something of the robot's."""
+        if message.topic == _STOP and message.payload.strip() and not message.retain:
+            stop = codec.decode(ESTOP, message.payload).stop
+            if stop is UNSET:
+                self._unnamed_at = self._scheduler.now
+            else:
+                self._first.setdefault(str(stop), self._scheduler.now)
+                self._stopped.setdefault(str(stop), self._scheduler.now)
+            return
         owner = self._topics.get(message.topic)
         if owner is None:
             return
@@ -135,12 +148,17 @@ class StopRules:
         self._check(
             self._scheduler.now - since < _REPEAT_S, "a stop is repeated to an owner that has withdrawn its own"
         )
-        self._first.setdefault(name, self._scheduler.now)  # if nothing passed: it had no connection to the robot
-        self._stopped.setdefault(name, self._scheduler.now)
+        # If nothing passed: it had no connection to the robot, or the stop is of that side, and had no name.
+        first = self._scheduler.now
+        if self._unnamed_at is not None and name not in self._came:
+            first = self._unnamed_at
+            self._counted.add(name)
+        self._first.setdefault(name, first)
+        self._stopped.setdefault(name, first)
         firsts = self._first | self._came_first
         shown = (first for other, first in firsts.items() if (owner, other) in self._shown)
         newest = max(firsts[name], *shown, 0.0)
-        missed = any(first > newest for first in firsts.values())
+        missed = any(first > newest for other, first in firsts.items() if other not in self._counted)
         self._check(not missed, "an older stop is repeated in place of a newer one")
 
     # -- what must hold at any time

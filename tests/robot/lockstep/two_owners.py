@@ -288,6 +288,8 @@ class TwoOwners:
         elif a % 4 == 1:
             self.freeze(self.bridge, _FROZEN_S[b % len(_FROZEN_S)])
         else:
+            assert self.stops is not None
+            self.stops.doubtful |= a % 8 != 2
             self.bridge.lose(_LOST_S[b % len(_LOST_S)], local=a % 8 == 2)
 
     def do_delay(self, a: int, b: int) -> None:

@@ -115,6 +115,10 @@ MEMBERS: dict[str, tuple[tuple[str, ...], str]] = {
     "a withdrawn owner is given up": (TWO, "serial! a 59s serial! 1s serial0 =a>tail a :a>all"),
     "a copy after a reset goes to nobody": (ONE, "a serial+a serial-a a : ="),
     "a copy goes to the owner that was not reset": (TWO, "a serial+a tail+a serial-a a :a>tail"),
+    "a copy replaces no newer stop, whose owner has shown the copied one": (
+        ONE,
+        "serial+a bridge serial?b b a =b>serial",
+    ),
     "a copy that waits passes": (TWO, "a serial?a b serial?b serial-b b :b>tail"),
     "a restart proves no reset": (ONE, "a serial+a serial0 a :a>all =a>serial"),
     "names have a bound, stops have none": (ONE, "a serial+a serial-a fill a : b a :a>all =b>serial"),
