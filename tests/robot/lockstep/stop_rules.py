@@ -36,6 +36,7 @@ class StopRules:
         self._scheduler, self._bridge, self._owners = scheduler, bridge, owners
         self._topics = {ESTOP_STATE.topic(BASE, owner=name): name for name in owners}
         self._nameless = 0  # that were pressed
+        self._named: set[str] = set()  # names of the others
         self._invented: set[str] = set()  # names that the bridge has given them
         self.doubtful = False  # the connection of stops was lost
         self._published: dict[str, EstopState] = {}  # by owner, the newest state
@@ -63,7 +64,9 @@ class StopRules:
     def sent(self, message: Message) -> None:
         """A person sends something, on either side."""
         if message.topic == _STOP and not message.retain:
-            self._nameless += codec.decode(ESTOP, message.payload).stop is UNSET
+            stop = codec.decode(ESTOP, message.payload).stop
+            self._nameless += stop is UNSET
+            self._named.add(str(stop))
         elif message.topic == _RESET:
             reset = codec.decode(ESTOP_RESET, message.payload)
             self._resets[reset.boot, reset.count] = self._scheduler.now
@@ -140,7 +143,8 @@ class StopRules:
         firsts = self._first | self._came_first
         shown = (first for other, first in firsts.items() if (owner, other) in self._shown)
         newest = max(firsts[name], *shown, 0.0)
-        missed = any(first > newest for first in firsts.values())
+        # A nameless one of the robot's own side is not shown under the name by which it is repeated.
+        missed = any(first > newest for other, first in firsts.items() if other in self._named | self._invented)
         self._check(not missed, "an older stop is repeated in place of a newer one")
 
     # -- what must hold at any time
