@@ -74,6 +74,8 @@ def _subclasses(kind: type[Section]) -> Iterator[type[Section]]:
 
 def main(arguments: list[str]) -> None:
     """Write the tables of all keys into the given folder; without one, the schema of this checkout."""
+    if arguments and arguments[0].startswith("-"):
+        sys.exit(__doc__)
     if arguments:
         folder = Path(arguments[0])
         folder.mkdir(parents=True, exist_ok=True)

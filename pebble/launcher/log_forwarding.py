@@ -3,16 +3,15 @@
 import logging
 import os
 import re
-import select
 import sys
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from typing import Self
 
 from pebble.config.secret_text import without_secrets
 from pebble.config.visible import shown
 from pebble.contract.payloads import LogRecord
+from pebble.runtime.output import NonBlockingWriter
 from pebble.runtime.parent import TAG
 
 LINE_LIMIT = 16_384  # bytes of a child's line; the rest of a longer line is dropped
@@ -89,29 +88,6 @@ class OwnRecords(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         self._forwarder.own_record(record, self.format(record))
-
-
-class NonBlockingWriter:
-    """A writer of lines that drops them if the descriptor has no room: a stopped terminal must not stop a robot."""
-
-    def __init__(self, descriptor: int) -> None:
-        if os.isatty(descriptor):  # it may have room for a part of a line only: opened again, it takes that part
-            with suppress(OSError):  # it is another user's
-                descriptor = os.open(os.ttyname(descriptor), os.O_WRONLY | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
-        self._descriptor = descriptor
-        self._poll = select.poll()
-        self._poll.register(descriptor, select.POLLOUT)
-        self.dropped = 0
-
-    def write(self, line: str) -> None:
-        data = line.encode(errors="replace")[: select.PIPE_BUF - 1] + b"\n"  # a pipe takes up to PIPE_BUF as a whole
-        try:
-            if self._poll.poll(0):
-                os.write(self._descriptor, data)
-                return
-        except OSError:  # the reader has gone
-            pass
-        self.dropped += 1
 
 
 class LevelReader:

@@ -17,6 +17,7 @@ from pebble.contract import ESTOP, codec
 from pebble.contract.payloads import EstopCommand, EstopState
 
 REPEAT_S = 0.5
+STATE_S = 1.2  # by then an owner has published a state after each stop: it may wait for others (pebble.motors.paced)
 WITHDRAWN_S = 60.0  # so long an owner may have no emergency stop before its pending one ends
 NAMES = 1024  # of stops: a minute of 17 in a second
 
@@ -73,6 +74,15 @@ class Owner:
     def has_had(self, name: str) -> bool:
         """True if the owner's newest state names this stop."""
         return self.state is not None and name in self.state.recent
+
+    def needs_it_again(self, now: float) -> bool:
+        """True if the pending stop is to be repeated. A nameless one only if it was lost: it would be another stop."""
+        if self.pending is None or self.withdrawn_at is not None:
+            return False
+        enough, state = self.pending.enough, self.state
+        if enough is None or state is None or state.boot != enough[0]:
+            return True
+        return state.count < enough[1] and now - self.pending.at >= STATE_S
 
     def confirms(self, name: str) -> bool:
         """True if the owner's newest state names this stop, except while a latched owner still has to save it."""
@@ -149,9 +159,10 @@ class PassedStops:
 
     def repeat(self) -> list[bytes]:
         """Return the payloads to publish again, on the local side only; call this every ``REPEAT_S``."""
+        now = self._clock()
         with self._lock:
             waiting = self.pending.items()
-            return [_encoded(stop.stop, owner=key) for key, stop in waiting if self._owners[key].withdrawn_at is None]
+            return [_encoded(stop.stop, owner=key) for key, stop in waiting if self._owners[key].needs_it_again(now)]
 
     def give_up(self) -> list[tuple[str, EstopCommand]]:
         """End the stops for owners whose state was withdrawn for too long; return them, each with its owner."""

@@ -304,8 +304,7 @@ class MqttBridge(ForwardingService):
             return
         gate, counters = self.forwarder.gate, self.forwarder.counters
         needs_no_bridge = gate is Gate.SHUT  # the two sides are one broker
-        forwards = gate is Gate.OPEN and bool(self.subscriptions[Side.REMOTE])
-        passes = self._same_broker.both_connected and (needs_no_bridge or forwards)
+        passes = self._same_broker.both_connected and (needs_no_bridge or bool(self.subscriptions[Side.REMOTE]))
         late, refused = counters[f"{Side.REMOTE.value}: {Drop.LATE.value}"], counters[f"{Side.LOCAL.value}: refused"]
         # Any change of these may mean a loss on the way in: late from the remote side, or refused by the local one.
         losses = gate, self.epoch, self._local_changes, refused, late, self.transport.counters["dropped"]

@@ -19,9 +19,10 @@ from pebble.contract.payloads import EstopCommand, LogRecord
 from pebble.launcher import log_forwarding
 from pebble.launcher.announcer import Announcer
 from pebble.launcher.announcer_pipe import MESSAGE_LIMIT, AnnouncerPipe, next_message
-from pebble.launcher.log_forwarding import LevelReader, LogForwarder, NonBlockingWriter, OwnRecords, text_of
+from pebble.launcher.log_forwarding import LevelReader, LogForwarder, OwnRecords, text_of
 from pebble.launcher.reactor import Reactor
 from pebble.launcher.repeated_stops import REPEAT_S, repeat_stops
+from pebble.runtime.output import NonBlockingWriter
 from pebble.runtime.parent import Notifier
 from pebble.transports import Message, QoS
 from pebble.transports.memory import MemoryHub, MemoryTransport

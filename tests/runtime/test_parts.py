@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import logging
+import os
 import random
 import re
 import signal
+import subprocess
+import sys
 import threading
 import time
 from math import inf
@@ -190,6 +193,17 @@ def test_a_lock_that_is_shut_is_never_entered() -> None:
     lock.shut()
     assert left.is_set(), "it waits for the thread that works"
     assert not lock.try_enter()
+
+
+def test_no_log_line_waits_for_a_launcher_that_stands_still() -> None:
+    program = "import logging, pebble.runtime.parent as p; p.set_up_logging('INFO')\n"
+    program += "for _ in range(200): logging.error('x' * 1000)"
+    read_end, write_end = os.pipe()
+    try:
+        assert subprocess.run([sys.executable, "-c", program], stderr=write_end, timeout=WAIT_S).returncode == 0
+    finally:
+        os.close(read_end)
+        os.close(write_end)
 
 
 def test_a_subject_of_a_log_makes_room_once_its_period_is_over() -> None:

@@ -4,7 +4,7 @@ import errno
 import os
 import sqlite3
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -54,9 +54,10 @@ class Database:
     @property
     def removed(self) -> str:
         """Return an error text if the file was removed or replaced; else empty."""
-        if self._own is None or self._own.in_place:
-            return ""
-        return f"{self._path} was removed or replaced: put it back, or start the page again"
+        with suppress(OSError):  # what is there cannot be seen: the connection goes on with the file that it opened
+            if self._own is not None and not self._own.in_place:
+                return f"{self._path} was removed or replaced: put it back, or start the page again"
+        return ""
 
     def rows(self, statement: str, values: Sequence[Any] = ()) -> list[Any]:
         """Return the rows that a statement yields. Raises DatabaseError."""

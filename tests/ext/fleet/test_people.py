@@ -249,7 +249,9 @@ def test_a_file_that_is_no_database(tmp_path: Path) -> None:
         People(file / "below")
 
 
-def test_a_file_that_is_gone_or_replaced_costs_nothing_until_the_next_start(tmp_path: Path) -> None:
+def test_a_file_that_is_gone_or_replaced_costs_nothing_until_the_next_start(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     file, backup = tmp_path / "state" / "people", tmp_path / "people"
     with closing(People(backup)) as others:
         others.add("bob", PASSWORD, Role.VIEWER)
@@ -260,8 +262,28 @@ def test_a_file_that_is_gone_or_replaced_costs_nothing_until_the_next_start(tmp_
         file.parent.mkdir()
         backup.rename(file)
         assert people.check("alice", PASSWORD, HERE) == User("alice", Role.DRIVER)
+        assert [record.levelname for record in caplog.records] == ["ERROR"], "once"
+        assert "people was removed or replaced: put it back" in caplog.text
+        file.rename(backup)
+        (tmp_path / "away" / "people").rename(file)
+        caplog.set_level("INFO")
+        assert people.check("alice", PASSWORD, HERE) == User("alice", Role.DRIVER)
+        assert caplog.records[-1].getMessage() == "people, sessions and the audit log are stored again"
+        backup.replace(file)
     with closing(People(file)) as people:
         assert people.list() == [User("bob", Role.VIEWER)]
+
+
+def test_a_folder_that_cannot_be_looked_into_ends_no_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(_file: object) -> None:  # as for other users than root
+        raise PermissionError
+
+    with closing(People(tmp_path / "people")) as people:
+        people.add("alice", PASSWORD, Role.DRIVER)
+        token = people.start_session(User("alice", Role.DRIVER))
+        session = people.session(token)
+        monkeypatch.setattr("pebble.transports.own_file.identity", refuse)
+        assert people.session(token) == session is not None
 
 
 def test_while_the_file_cannot_be_read_a_session_stays_what_it_was(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ import pytest
 
 from pebble.config import parse
 from pebble.contract import CONTROL, CONTROL_TAKE, CONTROL_VOUCHED, DRIVE, ESTOP, ESTOP_RESET
-from pebble.contract.payloads import Drive
+from pebble.contract.payloads import ControlRequest, Drive
 from pebble.errors import DeviceError
 from pebble.extensions.lab.simulation.pty import PtyMcu
 from pebble.runtime.process import view_of
@@ -73,8 +73,8 @@ class Bench:
         raw = {"robot": {"id": ROBOT}, "transport": transport, "services": services}
         config = parse(raw, folder=folder, env={})
         config = view_of(config, instance) if instance else config
-        settings = MemoryHub() if broker is None else MqttSettings(host="127.0.0.1", port=broker.port)
-        network = "memory" if broker is None else "mqtt"
+        settings: Any = MemoryHub() if broker is None else MqttSettings(host="127.0.0.1", port=broker.port)
+        network, self.network = "memory" if broker is None else "mqtt", settings
         self.world = Listener(create(network, "operator", settings))
         self.operator = self.world.transport
         name = f"robot-{instance}"
@@ -272,6 +272,29 @@ def test_a_drive_command_that_waited_renews_control_before_the_silence_counts(be
     assert until(lambda: counters["delivered"] == delivered + 2)
     go_on.set()
     assert bench.line("M 0.500 0.500")
+
+
+#: After what the silence of the holder may be a loss on the way.
+LOST: dict[str, Callable[[Bench], object]] = {
+    "a late drive command": lambda bench: bench.service.receive_drive(Drive(z=0.5), bench.service.clock() - 1.0),
+    "a late request": lambda bench: bench.service.receive_request(
+        ControlRequest(id="bbbbbbbb"), bench.service.clock() - 10.0
+    ),
+    "a connection": lambda bench: (bench.network.stop(), bench.network.start()),
+}
+
+
+@pytest.mark.parametrize("lost", LOST)
+def test_after_a_loss_no_silence_until_then_ends_control(bench: Bench, lost: str) -> None:
+    bench.send("control", {**ANN, "for_ms": 1000})
+    assert bench.world.became("control/serial", by="ann")
+    began = time.monotonic()
+    assert until(lambda: time.monotonic() > began + 1.1)
+    LOST[lost](bench)
+    vouched = b'{"from": 0, "to": %d}' % (1000 * time.monotonic())
+    assert until(lambda: bench.operator.publish(CONTROL_VOUCHED.topic(BASE), vouched))
+    bench.send("control", {"id": "cccccccc", "by": "otto"})
+    assert bench.world.became("control/serial", by="ann", asks="otto")
 
 
 # -- groups of commands: one write on the serial line, or nothing

@@ -14,6 +14,7 @@ from pebble.errors import PebbleError
 from pebble.extensions.operator.client.connection import Target, connecting, resolve
 from pebble.extensions.operator.commands import show
 from pebble.extensions.operator.commands.target import with_target
+from pebble.extensions.operator.notices import printing_thread
 from pebble.extensions.operator.signals import interrupted_by_signals
 from pebble.extensions.recordings.recorder import metrics
 from pebble.extensions.recordings.recorder.recorder import Recorder
@@ -21,6 +22,7 @@ from pebble.extensions.recordings.recorder.settings import EVERYTHING, Options
 from pebble.extensions.recordings.recorder.source import Source
 from pebble.launcher.sd_notify import SystemdNotifier
 from pebble.runtime.as_owner import as_owner
+from pebble.runtime.output import has_room
 from pebble.transports.topics import check_filter
 
 _TURN_S = 0.25
@@ -72,8 +74,11 @@ def record(
     recorder = Recorder(into, options, {"filters": " ".join(chosen)})
     with as_owner(into), suppress(OSError):  # the recorder reports it
         into.mkdir(mode=0o750, parents=True, exist_ok=True)
-    with as_owner(into):  # now that the folder exists: another user may have made it
+    # as_owner: now that the folder exists, as another user may have made it. A log line waits for no terminal.
+    with as_owner(into), printing_thread():
         _run(recorder, Source(recorder, kind, transport, chosen), where, length)
+    if sys.stderr.isatty():
+        typer.echo("", err=True)  # ends the line that _serve rewrites
     _print_end(recorder, into)
     return 0
 
@@ -94,8 +99,6 @@ def _run(recorder: Recorder, source: Source, where: str, length: str | None) -> 
             _serve(recorder, source, ends_at)
         except KeyboardInterrupt:
             pass
-        if sys.stderr.isatty():
-            typer.echo("", err=True)  # ends the line that _serve rewrites
 
 
 def _serve(recorder: Recorder, source: Source, ends_at: float | None) -> None:
@@ -113,7 +116,7 @@ def _serve(recorder: Recorder, source: Source, ends_at: float | None) -> None:
             printed = now
             line = _line(recorder, source, now - began)
             systemd.status(line)
-            if sys.stderr.isatty():
+            if sys.stderr.isatty() and has_room(sys.stderr.fileno()):
                 sys.stderr.write(f"\r\x1b[2K{line}")
                 sys.stderr.flush()
         if now - written >= _METRICS_S:

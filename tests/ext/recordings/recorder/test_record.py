@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,7 @@ from pebble.transports.memory import MemoryHub, MemoryTransport
 from tests.commands.command_line import Run, program
 from tests.ext.recordings.recorder.test_recorder import events, payloads, recorded
 from tests.kit.robot import Running
+from tests.kit.terminal import Terminal
 from tests.support import WAIT_S, AmqttBroker, Broker, until
 
 GOOB = "pebble/robots/goob"
@@ -147,6 +149,18 @@ def test_there_is_no_broker_yet(tmp_path: Path) -> None:
         assert process.stderr.readline() == "pebble: connecting to mqtt://127.0.0.1:1\n"
         assert "cannot connect to mqtt://127.0.0.1:1 yet" in process.stderr.readline()
         assert process.wait(WAIT_S) == 0
+
+
+def test_a_terminal_that_stands_still_delays_no_end_of_a_recording(tmp_path: Path) -> None:
+    broker, root = Broker(tmp_path), tmp_path / "rec"
+    options = (f"--url=mqtt://127.0.0.1:{broker.port}", f"--into={root}", "--for=2s")
+    with closing(Terminal(sys.executable, "-m", "pebble", "record", *options)) as console:
+        assert console.sees("Recording ")
+        with console.standing_still():
+            assert until(lambda: events(root, "stop"), step=0.2)
+        assert console.ends() == 0
+        assert "`pebble recordings info" in console.shown
+    broker.stop()
 
 
 @pytest.mark.parametrize(
