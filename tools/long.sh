@@ -15,7 +15,7 @@ make long PART=schedules  random schedules in virtual time, an hour
 make long PART=page       every state, card, interruption and finger at the operator page in Chromium, 25 minutes
 make long PART=engines    drive and stop a robot at the page in Firefox and WebKitGTK, five minutes
 make long PART=looks      store anew how the page looks, for PART=page to compare; look at the pictures, a minute
-make long PART=fleet      brokers and hubs that are killed, hung and cut off under driven robots and 300 boards, 16 minutes
+make long PART=fleet      brokers and hubs that are killed, hung and cut off under driven robots and 300 boards, three minutes
 make long PART=brokers    install NATS, RabbitMQ and aedes where possible, test robots with them, judge them, seven minutes
 make long PART=gstreamer  install GStreamer and OpenCV, and have them read the original's local media, three minutes
 make long PART=ros1       install Debian's rosmaster, rospy and roscpp where possible, and test the bridge with them, four minutes
