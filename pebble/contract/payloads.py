@@ -5,6 +5,7 @@ Values that the contract clamps are clamped when the struct is made, so no value
 """
 
 import math
+import sys
 from typing import Annotated, Any, Literal
 
 from msgspec import UNSET, Meta, Struct, UnsetType, field
@@ -15,12 +16,12 @@ from pebble.motion.lease import shown
 
 
 class Payload(Struct, frozen=True, kw_only=True, omit_defaults=False):
-    """The base class of JSON payloads. It refuses NaN and infinities in every number field."""
+    """The base class of JSON payloads. It refuses NaN, infinities, and integers that no float can hold."""
 
     def __post_init__(self) -> None:
         for name in self.__struct_fields__:
             value = getattr(self, name)
-            if isinstance(value, float) and not math.isfinite(value):
+            if isinstance(value, int | float) and not abs(value) <= sys.float_info.max:  # also NaN
                 raise ValueError(f"{name} is not a finite number")
 
     def ends(self) -> bool:

@@ -123,6 +123,7 @@ REFUSALS: dict[Channel, list[bytes]] = {
     c.REBOOT: [b"1", b'"true"', b"{}", b'{"value": 1}', b'{"enabled": "on"}', b'{"value": {"value": true}}', b"",
                b"null", b"[true]", b'{"on": true}', b"TRUE", b"true false"],
     c.DRIVE: [b"", b"null", b"[]", b"1", b"true", b'"x"', b'{"x": 1', b'{"x": 1}}'],
+    c.ONLINE: [b'{"t": ' + b"9" * 400 + b"}", b'{"t": -' + b"9" * 400 + b"}", b'{"t": NaN}'],
     c.OUTLET_COMMAND: [b"true", b"{}", b'{"on": 1}', b'{"value": {"on": null}}'],
     c.LIGHTS_FLASH: [b'{"period": 1e999}', b'{"b": 1, "period": "inf"}', b"[1, 1, 1]", b'"1"'],
     c.SOUNDBOARD_COMMAND: [

@@ -14,6 +14,7 @@ from pebble.extensions.recordings import library
 from pebble.extensions.recordings.files.writer import RecordingWriter
 from pebble.extensions.recordings.recorder.recorder import Recorder
 from pebble.extensions.recordings.recorder.settings import Options
+from pebble.extensions.recordings.traffic.index import index_path
 from tests.commands.command_line import Run
 from tests.ext.recordings.playing import THEN_NS
 from tests.support import refused
@@ -189,6 +190,16 @@ def test_mistakes_are_one_line(
     assert filled(problem) in run.err
     assert sorted(tmp_path.rglob("*")) == before
     assert len(run.err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize("arguments", [["{file}"], ["{rec}", "-r", "fred"]])
+def test_what_cannot_be_deleted_is_one_line(folder: Path, run: Run, arguments: list[str]) -> None:
+    files = list(folder.rglob("*.mcap"))
+    for path in files:
+        index_path(path).mkdir()
+    named = {"{file}": files[0], "{rec}": folder}
+    assert run("recordings", "rm", *(named.get(word, word) for word in arguments), "--yes") == 1
+    assert ("Is a directory" in run.err, run.err.count("\n")) == (True, 1)
 
 
 def test_a_foreign_file_cannot_forge_lines(tmp_path: Path, run: Run) -> None:

@@ -57,7 +57,7 @@ def rm(
     if robot is None and since is None and until is None:
         if folder.is_dir():
             raise PebbleError("what to delete is missing: name --robot, --since or --until")
-        with as_owner(folder.parent):
+        with as_owner(folder.parent), errors_of_files(folder):
             return _delete_whole(folder, yes=yes)
     since_ns, until_ns = period(since, until)
     base = None if robot is None else base_of(robot)
@@ -69,7 +69,8 @@ def rm(
     if not folder.is_dir():
         raise PebbleError(f"{folder}: there is no such folder")
     recordings = Folder(folder)
-    with as_owner(folder), recordings.taken():  # a recorder there would write its retained values again
+    # Locked, as a recorder there would write its retained values again.
+    with as_owner(folder), recordings.taken(), errors_of_files(folder):
         return _rm(recordings, base, (since_ns, until_ns), keeps, yes=yes)
 
 

@@ -93,7 +93,7 @@ def _line(message: Recorded) -> _Written:
     line = _Written(
         timestamp=Raw(b"%d.%09d" % (seconds, fraction)),
         topic=message.channel.topic,
-        qos=int(metadata.get("qos", "0")),
+        qos={"1": 1, "2": 2}.get(metadata.get("qos", ""), 0),  # other programs write words there
         retain=metadata.get("retain") == "1",
         retained=metadata.get("retained") == "1",
         payload_size_bytes=len(payload),

@@ -101,6 +101,9 @@ DRIVER: Rows = {
     **{f"{beside} {pressed} in {where or 'nothing'}": (
         f"key('{pressed}', {{ {beside or 'other'}: true, target: {FOCUS[where]} }});", expected)
         for pressed, beside, where, expected in PRESSES},
+    "what fills in a field presses no key": (f"""
+        const event = {{ target: {FOCUS["a field"]}, preventDefault() {{}} }};
+        driver.keyDown(event); driver.keyUp(event);""", []),
     "Enter takes control that is free": (f"""
         {FREE} key("Enter", {{ repeat: true }}); key("Enter", {{ target: {FOCUS["a button"]} }}); await null;
         const before = [...done]; key("Enter"); await null; result = [before, done];""", [[], ["lease", "ended"]]),

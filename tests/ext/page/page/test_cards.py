@@ -110,6 +110,20 @@ def test_a_control_sends_what_it_is_for(show: Show, server: CannedServer, name: 
         assert opened.complaints() == []
 
 
+@pytest.mark.parametrize("size", ["desktop", "phone", "landscape"])
+@pytest.mark.parametrize(("state", "names"), [("others-ask", ["let", "keep"]), ("driving", ["release"])])
+def test_what_appears_beside_a_button_takes_no_press_of_it(show: Show, state: str, names: list[str], size: str) -> None:
+    with show(STATES[state], size, when="document.querySelector('[data-test=see]')") as opened:
+        assert opened.until(lambda: opened.test("see").count() == 0)  # the first picture is here
+        boxes = [opened.test(name).bounding_box() for name in names]
+        opened.page.evaluate("pebble.driver.page.pictureAge = () => 5000")
+        opened.test("see").wait_for()
+        for name, box in zip(names, boxes, strict=True):
+            at = [box["x"] + box["width"] / 2, box["y"] + box["height"] / 2]
+            there = opened.page.evaluate("(at) => document.elementFromPoint(...at).closest('button').dataset.test", at)
+            assert there == name
+
+
 def test_stops_are_read_aloud_whatever_comes_right_after_them(show: Show) -> None:
     with show(STATES["fleet"]) as opened:
         opened.test("bell").wait_for()

@@ -82,6 +82,11 @@ def test_payloads_are_readable_where_they_are_text_or_json(payload: bytes, reada
     assert [message.payload for message in read(raw) if isinstance(message, Recorded)] == [payload]
 
 
+@pytest.mark.parametrize("qos", ["", "reliable", "9"])
+def test_a_qos_of_another_program_is_none(qos: str) -> None:
+    assert json.loads(written([recorded(b"{}", qos=qos)]))["qos"] == 0
+
+
 def shown(message: Recorded) -> tuple[object, ...]:
     return message.log_ns, message.channel.topic, message.payload, message.channel.metadata
 

@@ -374,8 +374,8 @@ function isMeta(event) {
   return event.key === "Meta" || event.key === "OS";
 }
 
-/** The keys of an emergency stop; "" none. Input methods may take Ctrl+Space. */
-function stopKeys({ code, ctrlKey, metaKey }) {
+/** The keys of an emergency stop; "" none. Input methods may take Ctrl+Space; what fills in a field has no code. */
+function stopKeys({ code = "", ctrlKey, metaKey }) {
   if (code.endsWith("Enter") && (ctrlKey || metaKey)) return "Ctrl+Enter";
   return code === "Space" && ctrlKey ? "Ctrl+Space" : "";
 }
