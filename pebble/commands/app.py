@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -99,6 +100,7 @@ class _Listed(TyperCommand):
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
         command = self._command(args)
+        _refuse_nan(command)
         if extra.get("resilient_parsing"):  # for Tab
             _complete_values(command)
         return command.make_context(info_name, args, parent, **extra)
@@ -141,6 +143,21 @@ def _complete_values(command: Any) -> None:
     if isinstance(command, TyperGroup):
         for subcommand in command.commands.values():
             _complete_values(subcommand)
+
+
+def _refuse_nan(command: Any) -> None:
+    """Let a command and its subcommands refuse NaN and infinity, which ranges of options let pass."""
+    for parameter in command.params:
+        if parameter.type.name.startswith("float"):
+            parameter.callback = parameter.callback or _finite
+    for subcommand in getattr(command, "commands", {}).values():
+        _refuse_nan(subcommand)
+
+
+def _finite(_context: Any, _parameter: Any, value: float | None) -> float | None:
+    if value is not None and not math.isfinite(value):
+        raise typer.BadParameter(f"{value} is not a finite number")
+    return value
 
 
 def _values(values: Callable[[Any], list[str]], context: Any, incomplete: str) -> list[_Completion]:

@@ -60,6 +60,8 @@ def test_a_command_imports_no_other() -> None:
         (("estop", "--password", "x"), "--password (Possible options: --password-file)", "pebble estop --help"),
         (("up",), "CONFIG", "pebble up --help"),
         (("sim", "bob"), "bob", "pebble sim --help"),
+        (("drive", "--speed", "nan"), "nan is not a finite number", "pebble drive --help"),
+        (("topic", "list", "-s", "inf"), "inf is not a finite number", "pebble topic list --help"),
         (("sim", "minilamp"), "--broker URL", "pebble sim --help"),
         (("doctor", "--running", "--report", "a.zip"), "--running or --report", "pebble doctor --help"),
         (("watch", "goob.json"), "--picture", "pebble watch --help"),

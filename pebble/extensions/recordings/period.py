@@ -20,6 +20,7 @@ _CLOCK: Final = re.compile(r"\d{1,2}:\d{2}(:\d{2}(\.\d{1,6})?)?", re.ASCII)
 _ZONED: Final = re.compile(
     r"(?P<time>.*\d)(\s*(?P<offset>Z|[+-]\d{2}:\d{2})|\s+(?P<name>[A-Za-z][A-Za-z0-9_+/-]+))", re.ASCII
 )
+_RANGE: Final = re.compile(r"(\d{1,2}:\d{2})-(\d{2}:\d{2})", re.ASCII)  # no time with an offset from UTC
 _UNIT_NS: Final = {"s": 10**9, "m": 60 * 10**9, "h": 3600 * 10**9, "d": 86_400 * 10**9}
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 _DAY: Final = timedelta(days=1)
@@ -47,6 +48,9 @@ def parse_period(since: str | None, until: str | None, *, now: datetime) -> tupl
 
 def _zoned(option: str, text: str, now: datetime) -> tuple[str, datetime]:
     """Return the text without its time zone, and ``now`` in that zone."""
+    if (both := _RANGE.fullmatch(text)) is not None:
+        zone = f'"{both[1]} -{both[2]}" is {both[1]} in that time zone'
+        raise PebbleError(f"{option} {text} may be a period: write --since {both[1]} --until {both[2]}; {zone}")
     match = _ZONED.fullmatch(text)
     if match is None:
         return text, now

@@ -102,6 +102,7 @@ def test_a_time_is_that_of_its_zone_on_its_day(since, until, expected, local):
         ("+5m", None, "is in the future: write -5m"),
         (None, "+5m", "counts from --since"),
         ("10:00 ../../etc/passwd", None, "is no time"),
+        ("10:00-11:00", None, 'write --since 10:00 --until 11:00; "10:00 -11:00" is 10:00 in that time zone'),
         (None, "24:61", "+5m or -1h"),
         ("2026-11-20", "2026-11-19", "--until 2026-11-19 is not after --since 2026-11-20"),
         ("10:00", "+0s", "is not after"),
