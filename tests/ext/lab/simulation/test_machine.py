@@ -176,6 +176,11 @@ def test_the_program(tmp_path: Path) -> None:
     assert not symlink.is_symlink()
 
 
+def test_a_trace_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DeviceError, match=r"gone/trace: No such file or directory"):
+        PtyMcu("goob", tmp_path / "port", trace=tmp_path / "gone" / "trace")
+
+
 def test_it_never_takes_a_file_away(tmp_path: Path) -> None:
     notes = tmp_path / "notes.txt"
     notes.write_text("precious")

@@ -35,7 +35,8 @@ def run(file: Path, folder: Path | None = None, *, trace: Path | None = None, co
     usual = Path(tempfile.gettempdir(), f"pebble-world-{path.stem}")
     folder = folder or usual
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        for made in (folder, trace or folder):
+            made.mkdir(parents=True, exist_ok=True)
         # The usual folder is among those of all users, where another user can take its name first.
         if folder == usual and (uid := folder.lstat().st_uid) not in (0, os.getuid()):
             raise DeviceError(f"{folder} belongs to user {uid}: choose another one with --folder")
