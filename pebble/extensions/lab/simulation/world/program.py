@@ -30,8 +30,9 @@ def run(file: Path, folder: Path | None = None, *, trace: Path | None = None, co
 
     ``folder`` is for serial ports, ``trace`` for files ROBOT.trace.jsonl of the lines that MCUs receive.
     """
-    end, path = EndSignal(), file.absolute()
-    world = read_world(path)
+    path = file.absolute()
+    world = read_world(path)  # before signals are handled: they end a read that waits, as of a pipe
+    end = EndSignal()
     usual = Path(tempfile.gettempdir(), f"pebble-world-{path.stem}")
     folder = folder or usual
     try:

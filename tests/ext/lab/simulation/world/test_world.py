@@ -264,6 +264,13 @@ def test_the_usual_folder_of_a_world_ends_with_it(room: Path) -> None:
     assert not usual.exists()
 
 
+def test_a_signal_ends_a_world_whose_file_is_a_pipe_that_sends_nothing(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with Child(command(tmp_path / "pipe")) as child, (tmp_path / "pipe").open("wb"):  # it waits for the other end
+        child.terminate()
+        assert child.wait(WAIT_S) == -signal.SIGTERM
+
+
 def test_a_world_is_driven_controlled_and_ended_by_its_standard_input(room: Path) -> None:
     described = json.loads(room.read_text())
     described["robots"]["goob"]["imu"] = True
