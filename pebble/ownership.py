@@ -44,6 +44,8 @@ def owner_of(folder: Path, *, nameless: bool = True, there: bool = False) -> Own
         if stat.S_ISLNK(status.st_mode):
             if owner.uid or uid:
                 raise PebbleError(f"{place} is a link of user {uid or owner.uid}: name the folder itself")
+            if _leads_in_a_circle(place):
+                raise PebbleError(f"{place} is a link that leads back to itself: remove it")
             target = place.readlink()
             if place.is_relative_to("/proc") and place.parent.name == "fd" and not target.is_absolute():
                 return owner  # a pipe of this process's, which a shell has made: `pebble check <(jq … robot.json)`
@@ -54,6 +56,14 @@ def owner_of(folder: Path, *, nameless: bool = True, there: bool = False) -> Own
             raise PebbleError(f"{place} belongs to root, and others may write there: chmod go-w it, or chown it")
         owner = Owner(uid, status.st_gid)
     return owner
+
+
+def _leads_in_a_circle(link: Path) -> bool:
+    try:
+        link.stat()
+    except OSError as error:  # it leads nowhere, or this user may not see where
+        return error.errno == errno.ELOOP
+    return False
 
 
 def others_in(folder: Path) -> str:

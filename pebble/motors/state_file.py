@@ -61,7 +61,7 @@ class StateFile:
         """True if this is a container and no volume holds the folder: the next container will not have the file."""
         if CONTAINER not in os.environ:
             return False
-        return str(next(folder for folder in self.path.resolve().parents if folder.is_mount())) in LOST
+        return str(next(folder for folder in Path(os.path.realpath(self.path)).parents if folder.is_mount())) in LOST
 
     def load(self) -> Any:
         """Return the value that was saved last; None without a file, Unreadable() if it is damaged."""

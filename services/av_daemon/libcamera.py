@@ -6,7 +6,7 @@ import time
 
 from pebble.errors import DeviceError
 from pebble.extensions.media.frames import FrameInfo
-from pebble.services.av_daemon.capture_program import CaptureProgram
+from pebble.services.av_daemon.capture_program import SILENCE_S, CaptureProgram
 from pebble.services.av_daemon.config import AvDaemon
 from pebble.services.av_daemon.jpeg_splitter import JpegSplitter
 from pebble.services.av_daemon.source import Capture
@@ -30,8 +30,13 @@ class LibcameraCamera(CaptureProgram):
 
     def grab(self) -> Capture:
         pictures: list[bytes] = []
+        until: float | None = None  # from the first bytes on
         while not pictures:
             pictures = self._splitter.feed(self.read())
+            now = time.monotonic()
+            until = now + SILENCE_S if until is None else until
+            if not pictures and now > until:
+                raise DeviceError(f"{self.name} writes no whole JPEG: is it the camera's own program?")
         newest = pictures[-1]
         return Capture(self._info, len(newest), newest, at_ns=time.monotonic_ns(), skipped=len(pictures) - 1)
 

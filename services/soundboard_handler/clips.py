@@ -46,7 +46,7 @@ class Clips:
         also by ``find``.
         """
         self.problem = ""
-        root = self._folder.resolve()
+        root = self._root
         names = (path[len(str(root)) :].lstrip("/") for path in self._paths())
         clips = sorted(filter(self._can_be_named, names), key=lambda name: (name.lower(), name))
         sizes = accumulate(len(name.encode()) for name in clips)  # of the list up to each clip
@@ -67,16 +67,21 @@ class Clips:
             clip = self._clip(self._path(meant(self._paths(), str(path))), name)
         return clip
 
+    @property
+    def _root(self) -> Path:
+        """The folder, with links resolved; as it is written if its links lead in a circle."""
+        return Path(os.path.realpath(self._folder))
+
     def _path(self, name: str) -> Path | None:
         """Return the path that a name means, with links resolved; None if it means none."""
         try:
-            return (self._folder.resolve() / _expanded(name.replace("\\", "/"))).resolve()
+            return (self._root / _expanded(name.replace("\\", "/"))).resolve()
         except (OSError, RuntimeError, ValueError):  # links in a circle, no text of a path
             return None
 
     def _clip(self, path: Path | None, name: str) -> Clip | None:
         """Return the clip at this path, or None. It is called ``name`` if its path cannot be written as UTF-8."""
-        root = self._folder.resolve()
+        root = self._root
         if path is None or not path.is_relative_to(root) or path.suffix.lower() not in self._endings:
             return None
         try:
@@ -89,7 +94,7 @@ class Clips:
 
     def _paths(self) -> Iterator[str]:
         """Yield the paths of the clips among the first _MOST files, in the folder's order and spelling."""
-        return filter(self._is_clip, islice(self._files(self._folder.resolve()), _MOST))
+        return filter(self._is_clip, islice(self._files(self._root), _MOST))
 
     def _files(self, root: Path) -> Iterator[str]:
         def failed(error: OSError) -> None:

@@ -128,6 +128,12 @@ def linked(theirs: Path) -> Path:
     return theirs / "link" / "deeper"
 
 
+def circle(theirs: Path) -> Path:
+    (theirs.parent / "roots" / "there").symlink_to("back")
+    (back := theirs.parent / "roots" / "back").symlink_to("there")
+    return back / "deeper"
+
+
 def of_root(theirs: Path) -> Path:
     (theirs / "roots").mkdir()
     return theirs / "roots"
@@ -161,6 +167,7 @@ def listed(theirs: Path) -> Path:
     ("path_of", "why"),
     [
         (linked, "is a link of user 65534"),
+        (circle, "leads back to itself: remove it"),
         (of_root, "lies in a folder of user 65534"),
         (shared, "others may write"),
         (open_file, "others may write"),

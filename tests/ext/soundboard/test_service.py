@@ -363,6 +363,10 @@ def test_what_cannot_be_read_or_named_is_left_out_and_reported(tmp_path: Path) -
     missing = Clips(tmp_path / "missing")
     assert missing.scan() == []
     assert missing.problem == f"{tmp_path}/missing cannot be read: No such file or directory"
+    (tmp_path / "circle").symlink_to("circle")
+    circle = Clips(tmp_path / "circle")
+    assert (circle.scan(), circle.find("good.wav")) == ([], None)
+    assert circle.problem == f"{tmp_path}/circle cannot be read: Too many levels of symbolic links"
     assert missing.find("a.wav") is None
     put(tmp_path, "good.wav", "back\\slash.wav")
     clips = Clips(tmp_path)

@@ -7,6 +7,8 @@ from typing import BinaryIO, Literal
 
 import msgspec
 
+from pebble.errors import DeviceError
+
 _RETAINED = 100_000  # entries in memory; a file has all of them
 
 Event = Literal["plugged", "opened", "line", "closed", "unplugged", "motors", "said", "late"]
@@ -58,11 +60,17 @@ def motors_entry(ns: int, motors: tuple[float, float]) -> Entry:
 
 
 class Trace:
-    """Entries in the order of their arrival; with ``path`` also a file, with one JSON object per line, unbuffered."""
+    """Entries in the order of their arrival; with ``path`` also a file, with one JSON object per line, unbuffered.
+
+    Raises DeviceError if the file cannot be opened.
+    """
 
     def __init__(self, path: Path | None = None) -> None:
         self._entries: deque[Entry] = deque(maxlen=_RETAINED)
-        self._file: BinaryIO | None = path.open("ab", buffering=0) if path is not None else None
+        try:
+            self._file: BinaryIO | None = path.open("ab", buffering=0) if path is not None else None
+        except OSError as error:
+            raise DeviceError(f"{error.filename}: {error.strerror}") from None
 
     def add(self, entry: Entry) -> None:
         self._entries.append(entry)

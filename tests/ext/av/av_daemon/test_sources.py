@@ -25,7 +25,7 @@ from pebble.extensions.media.frames import FrameInfo
 from pebble.extensions.media.frames.frame import picture
 from pebble.extensions.media.scene import Scene
 from pebble.extensions.media.speech import Speech
-from pebble.services.av_daemon import alsa, capture_program, sources
+from pebble.services.av_daemon import alsa, capture_program, libcamera, sources
 from pebble.services.av_daemon.alsa import AlsaMicrophone
 from pebble.services.av_daemon.capture_program import CaptureProgram
 from pebble.services.av_daemon.health import Asked, Health, RateCheck
@@ -94,6 +94,10 @@ class TestLibcamera:
         monkeypatch.setattr(LibcameraCamera, "read", lambda _self: b"".join(pictures))
         capture = camera.grab()
         assert (capture.data, capture.skipped) == (pictures[-1], 2)
+        monkeypatch.setattr(libcamera, "SILENCE_S", 0.1)
+        monkeypatch.setattr(LibcameraCamera, "read", lambda _self: time.sleep(0.01) or pictures[0][:-9])
+        with pytest.raises(DeviceError, match="libcamera-vid writes no whole JPEG"):
+            camera.grab()
 
     def test_a_wait_can_be_interrupted_and_leaves_no_thread(
         self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path

@@ -16,6 +16,7 @@ from pebble.extensions.lab.simulation.board import SimulatedMcu
 from pebble.extensions.lab.simulation.micropython.board import Board
 from pebble.extensions.lab.simulation.micropython.clock import VirtualClock
 from pebble.extensions.lab.simulation.micropython.faults import SharedPwm, WouldHang
+from pebble.extensions.lab.simulation.micropython.files import Files
 from pebble.extensions.lab.simulation.micropython.ports import ESP32_C6
 from pebble.extensions.lab.simulation.micropython.timers import BoardReset
 from pebble.extensions.lab.simulation.pty import PtyMcu
@@ -174,6 +175,14 @@ def test_the_program(tmp_path: Path) -> None:
         assert program.wait(WAIT_S) == 0
     assert [entry.line for entry in read_trace(trace) if entry.event == "line"] == ["M 1 1"]
     assert not symlink.is_symlink()
+
+
+def test_a_trace_or_a_folder_of_files_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DeviceError, match=r"gone/trace: No such file or directory"):
+        PtyMcu("goob", tmp_path / "port", trace=tmp_path / "gone" / "trace")
+    (tmp_path / "notes").touch()
+    with pytest.raises(DeviceError, match=r"notes: File exists"):
+        Files(tmp_path / "notes")
 
 
 def test_it_never_takes_a_file_away(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO
 
+from pebble.errors import DeviceError
 from pebble.extensions.lab.simulation.micropython.faults import failure
 
 
@@ -14,7 +15,7 @@ class Files(dict[str, bytes]):
 
     As with LittleFS, a written file changes when it is closed, and a rename replaces its target at once. ``before(what,
     path, data)`` is called before each change by the firmware; ``what`` is "write" or "rename". It may raise an
-    OSError, or an exception of a test, in place of a power cut.
+    OSError, or an exception of a test, in place of a power cut. Raises DeviceError for a folder that cannot be used.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
@@ -22,8 +23,11 @@ class Files(dict[str, bytes]):
         self.before: Callable[[str, str, bytes], None] = lambda _what, _path, _data: None
         self._folder = folder
         if folder is not None:
-            folder.mkdir(parents=True, exist_ok=True)
-            self.update({f"/{file.name}": file.read_bytes() for file in folder.iterdir() if file.is_file()})
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+                self.update({f"/{file.name}": file.read_bytes() for file in folder.iterdir() if file.is_file()})
+            except OSError as error:
+                raise DeviceError(f"{error.filename}: {error.strerror}") from None
 
     def open(self, path: str, mode: str = "r") -> IO[bytes] | IO[str]:
         """Open a file as the firmware's ``open`` does: to read it, or to write it as a whole."""

@@ -30,12 +30,14 @@ def run(file: Path, folder: Path | None = None, *, trace: Path | None = None, co
 
     ``folder`` is for serial ports, ``trace`` for files ROBOT.trace.jsonl of the lines that MCUs receive.
     """
-    end, path = EndSignal(), file.absolute()
-    world = read_world(path)
+    path = file.absolute()
+    world = read_world(path)  # before signals are handled: they end a read that waits, as of a pipe
+    end = EndSignal()
     usual = Path(tempfile.gettempdir(), f"pebble-world-{path.stem}")
     folder = folder or usual
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        for made in (folder, trace or folder):
+            made.mkdir(parents=True, exist_ok=True)
         # The usual folder is among those of all users, where another user can take its name first.
         if folder == usual and (uid := folder.lstat().st_uid) not in (0, os.getuid()):
             raise DeviceError(f"{folder} belongs to user {uid}: choose another one with --folder")

@@ -264,13 +264,21 @@ def test_the_usual_folder_of_a_world_ends_with_it(room: Path) -> None:
     assert not usual.exists()
 
 
+def test_a_signal_ends_a_world_whose_file_is_a_pipe_that_sends_nothing(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with Child(command(tmp_path / "pipe")) as child, (tmp_path / "pipe").open("wb"):  # it waits for the other end
+        child.terminate()
+        assert child.wait(WAIT_S) == -signal.SIGTERM
+
+
 def test_a_world_is_driven_controlled_and_ended_by_its_standard_input(room: Path) -> None:
     described = json.loads(room.read_text())
     described["robots"]["goob"]["imu"] = True
     room.write_text(json.dumps(described))
     folder = room.parent / "f"
     goob, imu = port_path(folder, "goob"), imu_port_path(folder, "goob")
-    with running(room, "--trace", str(folder), "--control") as world:
+    traces = room.parent / "new" / "traces"
+    with running(room, "--trace", str(traces), "--control") as world:
         start = poses(room)
         assert start["goob"] == pytest.approx((-0.8, 0.4, -0.5236), abs=1e-4)
         with serial.Serial(str(imu), timeout=30) as line:
@@ -289,7 +297,7 @@ def test_a_world_is_driven_controlled_and_ended_by_its_standard_input(room: Path
         world.stdin.close()
         assert world.wait(30) == 0, "the end of standard input ends it"
         world.stdin, printed = None, world.stdout.read()
-    assert "M 0.5 0.5" in [entry.line for entry in read_trace(trace_path(folder, "goob"))]
+    assert "M 0.5 0.5" in [entry.line for entry in read_trace(trace_path(traces, "goob"))]
     assert poses(room) == {}, "nothing is left of a world that has ended"
     assert f'"serial_mcu_bridge": {{"serial":{{"port":"{port_path(folder, "fred")}"}}' in printed
     assert f'"instances":{{"imu":{{"protocol":"pebble_serial_v1","serial":{{"port":"{imu}"' in printed
