@@ -49,8 +49,8 @@ def parse_period(since: str | None, until: str | None, *, now: datetime) -> tupl
 def _zoned(option: str, text: str, now: datetime) -> tuple[str, datetime]:
     """Return the text without its time zone, and ``now`` in that zone."""
     if (both := _RANGE.fullmatch(text)) is not None:
-        zone = f'"{both[1]} -{both[2]}" is {both[1]} in that time zone'
-        raise PebbleError(f"{option} {text} may be a period: write --since {both[1]} --until {both[2]}; {zone}")
+        meant = f'"{both[1]} -{both[2]}" is {both[1]} in that time zone'
+        raise PebbleError(f"{option} {text} may be a period: write --since {both[1]} --until {both[2]}; {meant}")
     match = _ZONED.fullmatch(text)
     if match is None:
         return text, now
