@@ -455,7 +455,7 @@ def test_a_handshake_may_take_long_while_bytes_arrive(tls_broker: Broker, goes_o
             {"ca_cert": "other-ca.crt", "insecure": True},
             "; name its authority: --ca-cert FILE, tls.ca_cert",
         ),
-        ("localhost", {"client_cert": None, "client_key": None}, ""),  # the broker wants one
+        ("localhost", {"client_cert": None, "client_key": None}, "certificate required; give this machine one"),
         ("localhost", None, "if this port is for TLS: mqtts://"),
         ("plain", {}, "it answers no TLS; if this port is not for TLS: mqtt://"),
     ],
