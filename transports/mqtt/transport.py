@@ -270,6 +270,9 @@ class MqttTransport(Transport):
     def _note_loss(self, connection: Connection, lost: Lost) -> None:
         """Note the messages for which the broker may have closed the connection."""
         written = None if isinstance(lost, Silent) else connection.written_before_loss()
+        if self.will is None:
+            never_acked = written is not None and connection.in_flight.never_acked
+            self._dialler.limits.note_loss(never_acked=never_acked, now=time.monotonic())
         with self._publishing:
             self._refused.note_loss(connection.where, written, time.monotonic())
 
