@@ -7,6 +7,7 @@
 import errno
 import gc
 import os
+import signal
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -22,6 +23,7 @@ def main() -> int:
     """Run the command line; return the exit code."""
     _use_utf8()
     _open_missing_streams()
+    _accept_signals()
     sys.excepthook = _print_error
     for stream in (sys.stdout, sys.stderr):
         stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]  # what a terminal cannot show
@@ -82,6 +84,15 @@ def _open_missing_streams() -> None:
             os.set_inheritable(descriptor, True)
             # closefd: a forked child puts a pipe at this number and drops the stream, which must not close the pipe.
             setattr(sys, name, os.fdopen(descriptor, mode, encoding="utf-8", closefd=False))
+
+
+def _accept_signals() -> None:
+    """Let SIGTERM end this program, and its children be waited for, if the caller has blocked or ignored signals."""
+    if sys.platform != "win32":
+        signal.pthread_sigmask(signal.SIG_SETMASK, ())
+        for number in (signal.SIGTERM, signal.SIGCHLD):
+            if signal.getsignal(number) is signal.SIG_IGN:
+                signal.signal(number, signal.SIG_DFL)
 
 
 def _without_secrets(text: str) -> str:

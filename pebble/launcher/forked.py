@@ -37,7 +37,8 @@ def become(
     code = 1
 
     def begin() -> None:
-        os.setpgid(0, 0)
+        with suppress(PermissionError):  # a container's filter: then Ctrl-C in a terminal reaches this process, too
+            os.setpgid(0, 0)
         _arrange_descriptors(stdin, output, notes)
         _reset_signals()
         _forget_launcher({**environment, NOTIFY_FD: str(_NOTES)})  # this becomes the child's environment

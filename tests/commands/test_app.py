@@ -105,13 +105,26 @@ def test_up_refuses_a_robot_that_runs_on_its_own_mcu(run: Run, tmp_path: Path) -
     assert "runs on its own MCU" in run.err
 
 
-@pytest.mark.parametrize("closed", some(["<&- >&- 2>&-", ">&-"], 2))
-def test_a_robot_runs_without_standard_streams(tmp_path: Path, closed: str) -> None:
+_BLOCKED = "import os, signal, sys; signal.pthread_sigmask(0, range(1, 32)); os.execvp(sys.argv[1], sys.argv[1:])"
+
+
+@pytest.mark.parametrize(
+    "caller",
+    some(
+        [
+            'exec "$@" <&- >&- 2>&-',
+            'exec "$@" >&-',
+            f"trap '' TERM; exec {sys.executable} -c '{_BLOCKED}' \"$@\"",
+        ],
+        2,
+    ),
+)
+def test_a_robot_runs_and_ends_whatever_its_caller_has_closed_blocked_or_ignored(tmp_path: Path, caller: str) -> None:
     config = config_file(
         tmp_path, transport={"kind": "mqtt", "run_dir": str(tmp_path / "run")}, local_mqtt={"port": free_port()}
     )
     command = [sys.executable, "-m", "pebble.cli", "up", str(config)]
-    with subprocess.Popen(["sh", "-c", f'exec "$@" {closed}', "sh", *command], cwd=ROOT) as robot:
+    with subprocess.Popen(["sh", "-c", caller, "sh", *command], cwd=ROOT) as robot:
         children = Path(f"/proc/{robot.pid}/task/{robot.pid}/children")
         assert until(lambda: robot.poll() is not None or children.read_text())
         robot.terminate()

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 import shutil
+import signal
 import socket
 import ssl
 import subprocess
@@ -270,6 +272,25 @@ def test_a_topic_on_which_the_broker_hangs_up_costs_that_topic_until_it_is_allow
             assert until(lambda: received.payloads)
 
 
+def test_a_state_that_the_broker_has_refused_arrives_once_it_is_allowed(
+    tmp_path: Path, clients: Clients, topic: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(refused_topics, "RETRY_S", 0.3)
+    rules, received = tmp_path / "rules", Received()
+    rules.write_text("topic read #\n")
+    broker = Broker(tmp_path, f"acl_file {rules}")
+    robot = clients(broker.port, "robot", protocol="5", silence_s=0.4)
+    clients(broker.port).subscribe(f"{topic}/#", received)
+    robot.publish(f"{topic}/state", b"1", qos=DELIVERED, retain=True)
+    robot.publish(f"{topic}/others", b"1", qos=DELIVERED, retain=True, shared=True)
+    assert until(lambda: robot.counters["publications_refused"] >= 3)  # it is tried again
+    rules.write_text("topic readwrite #\n")
+    os.kill(broker.pid, signal.SIGHUP)
+    assert until(lambda: received.payloads == [b"1"])
+    assert robot.counters["connected"] == 1
+    broker.stop()
+
+
 def test_close_does_not_wait_for_a_silent_broker(clients: Clients, proxy: TcpProxy) -> None:
     proxy.blackhole()
     others = set(threading.enumerate())
@@ -455,7 +476,7 @@ def test_a_handshake_may_take_long_while_bytes_arrive(tls_broker: Broker, goes_o
             {"ca_cert": "other-ca.crt", "insecure": True},
             "; name its authority: --ca-cert FILE, tls.ca_cert",
         ),
-        ("localhost", {"client_cert": None, "client_key": None}, ""),  # the broker wants one
+        ("localhost", {"client_cert": None, "client_key": None}, "certificate required; give this machine one"),
         ("localhost", None, "if this port is for TLS: mqtts://"),
         ("plain", {}, "it answers no TLS; if this port is not for TLS: mqtt://"),
     ],

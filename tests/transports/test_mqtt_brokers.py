@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import socket
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from threading import Event
 from types import SimpleNamespace
@@ -311,12 +312,13 @@ def test_messages_pass_both_ways_and_one_warning_names_what_is_lost(
     operator = MqttTransport("operator", MqttSettings(host="127.0.0.1", port=broker.port)).open()
     try:
         seen, commands = Received(), Received()
+        stop = partial(operator.publish, "commands/stop", b"", urgent=True)
         operator.subscribe("robot/#", seen)
         robot.open().subscribe("commands/#", commands, echo=False)
         robot.publish("robot/state", b"state", qos=QoS.DELIVERED, retain=True)
         assert until(lambda: b"state" in seen.payloads)
         assert until(lambda: robot.publish("robot/event", b"event", qos=QoS.DELIVERED) and b"event" in seen.payloads)
-        assert until(lambda: operator.publish("commands/stop", b"", urgent=True) and commands.payloads)
+        assert until(lambda: stop(qos=QoS.DELIVERED) and commands.payloads)
         assert until(lambda: any(lost in line for line in caplog.messages))
         warned = [line for line in caplog.messages if "that is changed" in line]
         assert len(warned) == ("retain" in lost)

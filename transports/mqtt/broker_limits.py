@@ -11,6 +11,7 @@ from msgspec.structs import replace
 from pebble.transports.base import Message, QoS
 from pebble.transports.mqtt.bridge_mode import Result
 
+_NEVER_ACKED: Final = 2  # hang-ups in a row after messages of QoS 1, without a single acknowledgement
 _VALID_S: Final = 600.0  # after which the next connection is made with everything again
 
 
@@ -66,12 +67,14 @@ class BrokerLimits:
 
     On 3.1.1 a broker hangs up on a will that is retained or has QoS 1, as mosquitto does, and so does a proxy whose
     broker is away: a hang-up counts only after the same broker has accepted a CONNECT without a will. A client without
-    a will cannot learn these limits. Instead it withholds the topics on which the broker hangs up (refused_topics.py).
+    a will learns only that QoS 1 is lacking, by `note_loss`; it withholds topics on which the broker hangs up
+    (refused_topics.py).
     """
 
     def __init__(self) -> None:
         self.limits = EVERYTHING  # of the next connection
         self._asking = Asking.NOTHING
+        self._never_acked = 0  # connections in a row that were lost so
         self._since = float("-inf")  # when the limits were last reduced
 
     @property
@@ -119,6 +122,15 @@ class BrokerLimits:
             self._reduce(_STEPS[_STEPS.index(self.limits) + 1], now)
         elif again and result is not Result.ACCEPTED:
             self.limits = EVERYTHING
+
+    def note_loss(self, *, never_acked: bool, now: float) -> None:
+        """Note the loss of a connection of a client without a will; the second hang-up on QoS 1 in a row ends its use.
+
+        ``never_acked``: the broker has hung up, and acknowledged none of the messages of QoS 1 before.
+        """
+        self._never_acked = self._never_acked + 1 if never_acked else 0
+        if self._never_acked >= _NEVER_ACKED and self.limits.qos:
+            self.limits, self._since = replace(self.limits, qos=0), now
 
     def _reduce(self, limits: Limits, now: float) -> None:
         """Connect again at once, with these limits."""

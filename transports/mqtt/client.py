@@ -15,6 +15,7 @@ from typing import NamedTuple
 from pebble.transports.base import Message
 from pebble.transports.hosts import CONNECT_TIMEOUT_S, HANDSHAKE_S, Address, dial
 from pebble.transports.mqtt import packets
+from pebble.transports.mqtt.ending import alert
 from pebble.transports.mqtt.packets import MOST_IDS, Filter, Listener, Reader, SendQuota
 from pebble.transports.mqtt.poll import SocketPoll
 from pebble.transports.settings import MqttSettings
@@ -101,6 +102,7 @@ class Client:
         self.unwritten = 0  # bytes that the kernel has not accepted yet
         self.drained = True  # `receive` has emptied the socket
         self.hung_up = False  # the other side has ended the connection, in whatever way
+        self.failure: OSError | None = None  # why there is nothing more to read, if not because of a FIN
         self.waiting: deque[bytes] = deque()  # to be written, once the socket accepts more
         self._modern = settings.protocol == "5"
         self._opening = opening
@@ -159,7 +161,7 @@ class Client:
         except OSError as failure:
             data, error = b"", failure
         if not data:
-            self.hung_up = is_hang_up(error)
+            self.hung_up, self.failure = is_hang_up(error), error
             self.close()
         # Fewer bytes than asked for: the socket has no more. With TLS their number does not tell that.
         self.drained = not data or (len(data) < _PIECE and self._opening.context is None)
@@ -233,6 +235,16 @@ class Client:
                     pass
         self.close()
 
+    def _fail(self, error: OSError) -> None:
+        """Close the socket, as a write has failed. The other side's reason, an alert of TLS, may be readable still."""
+        if self.socket is not None and self._opening.context is not None:
+            try:
+                self.socket.recv(1)
+            except OSError as reason:
+                error = reason if alert(reason) else error
+        self.hung_up, self.failure = is_hang_up(error), error
+        self.close()
+
     def _next_id(self) -> int:
         self._mid = self._mid % MOST_IDS + 1
         return self._mid
@@ -247,8 +259,7 @@ class Client:
             except _NOT_NOW:
                 written = 0
             except OSError as error:
-                self.hung_up = is_hang_up(error)
-                self.close()
+                self._fail(error)
                 return
             if written == len(data):
                 return

@@ -19,7 +19,7 @@ from pebble.transports.counters import Counters
 from pebble.transports.mqtt.bridge_mode import Result
 from pebble.transports.mqtt.broker_limits import EVERYTHING, Limits
 from pebble.transports.mqtt.client import Client, Opening, TlsLateError, keep_unsent
-from pebble.transports.mqtt.ending import WANTS_TLS, Absent, Lost, Refused, Silent, TlsLate, unreached
+from pebble.transports.mqtt.ending import WANTS_TLS, Absent, Lost, Refused, Silent, TlsLate, alert, unreached
 from pebble.transports.mqtt.incoming import OVERSLEPT_S, Incoming, Owner
 from pebble.transports.mqtt.outgoing import (
     Backlog,
@@ -113,6 +113,9 @@ class Connection:
         except Refused:
             raise
         except Lost as lost:
+            failure = self.client.failure
+            if failure is not None and alert(failure):  # TLS 1.3: that our certificate is refused shows only now
+                raise Lost(f"{self.where} cannot be reached: {unreached(failure, tls=True)}") from None
             if self.client.socket is None:  # the broker closed it
                 fix = "" if self._settings.tls else f"; {WANTS_TLS}"
                 raise Refused(f"{self.where} hung up on our CONNECT{fix}", Result.HUNG_UP) from None

@@ -142,6 +142,11 @@ class InFlightTable:
         return len(self._unacked)
 
     @property
+    def never_acked(self) -> bool:
+        """True if messages of QoS 1 were sent, and the broker has acknowledged none on this connection."""
+        return bool(self._unacked) and self._acked_at == float("-inf")
+
+    @property
     def waiting_since(self) -> float | None:
         """Time of sending the oldest message without PUBACK or, if later, of the newest PUBACK; None if none waits."""
         if not self._unacked:

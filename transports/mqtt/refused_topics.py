@@ -48,6 +48,7 @@ class RefusedTopics:
         self._client_id, self._vital = client_id, vital
         self._losses: dict[str, int] = {}  # in a row, by topic
         self.withheld: dict[str, Withheld] = {}  # by topic: what is not sent, as the broker hangs up
+        self._again: dict[str, float] = {}  # topics of refused messages: when a retained one is sent again
         self._trial: Trial | None = None
         self._quiet_at = -inf  # a trial begins after this time, which is QUIET_S after the newest loss
         #: Topics that were logged as refused, withheld or not: why, and when that was last in the log.
@@ -83,6 +84,18 @@ class RefusedTopics:
                 self._trial = Trial(topic, now + WINDOW_S)
                 yield messages[topic]
                 return
+
+    def refuse(self, where: str, topic: str, why: str, now: float) -> None:
+        """Note that the broker has refused a message, perhaps because of a quota; `refused_due` yields its topic."""
+        if len(self._again) < TOPICS:
+            self._again.setdefault(topic, now + RETRY_S)
+        self.report(where, topic, why, now)
+
+    def refused_due(self, now: float) -> Iterator[str]:
+        """Yield the topics, each once, whose message was refused RETRY_S ago."""
+        for topic in [topic for topic, at in self._again.items() if now >= at]:
+            del self._again[topic]
+            yield topic
 
     def note_loss(self, where: str, written: Mapping[str, int] | None, now: float) -> None:
         """Note a lost connection. ``written``: by topic, the size of a message that may be why; None: no message is."""

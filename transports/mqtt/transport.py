@@ -261,6 +261,8 @@ class MqttTransport(Transport):
                     self._sync_retained(self._own.keys())
                 if self._refused.withheld:  # topics that are not sent, as the broker hangs up on them
                     self._try_withheld(connection)
+                for topic in self._refused.refused_due(time.monotonic()):
+                    self._send_refused(topic)
         except Lost as lost:
             self._note_loss(connection, lost)
             raise
@@ -268,6 +270,9 @@ class MqttTransport(Transport):
     def _note_loss(self, connection: Connection, lost: Lost) -> None:
         """Note the messages for which the broker may have closed the connection."""
         written = None if isinstance(lost, Silent) else connection.written_before_loss()
+        if self.will is None:
+            never_acked = written is not None and connection.in_flight.never_acked
+            self._dialler.limits.note_loss(never_acked=never_acked, now=time.monotonic())
         with self._publishing:
             self._refused.note_loss(connection.where, written, time.monotonic())
 
@@ -276,6 +281,12 @@ class MqttTransport(Transport):
         with self._publishing:
             for message in self._refused.due(self._own, connection.where, time.monotonic()):
                 self._own.remember(message, sent=self._send(message, False))  # not urgent
+
+    def _send_refused(self, topic: str) -> None:
+        """Send our retained message of a topic again, unless others publish there, too: theirs may be newer."""
+        with self._publishing:
+            if (message := self._own.get(topic)) is not None and topic not in self._own.shared:
+                self._own.remember(message, sent=self._send(message, False))
 
     def _report_limits(self, connection: Connection) -> None:
         limits = connection.limits
@@ -389,7 +400,7 @@ class MqttTransport(Transport):
                     subscription.refused = is_refused
 
     def note_refusal(self, topic: str, why: str) -> None:
-        self._refused.report(self._dialler.addresses.where, topic, why, time.monotonic())
+        self._refused.refuse(self._dialler.addresses.where, topic, why, time.monotonic())
 
     def _finish(self, connection: Connection, will: Message | None) -> None:
         """Publish the will, wait (bounded) until everything is acknowledged, then send DISCONNECT."""

@@ -91,6 +91,7 @@ class PahoClient:
         client_id, settings, context, will, *_ = opening
         self.drained = True  # `receive` has emptied the socket
         self.hung_up = True  # so that a failed write counts as a hang-up: paho does not say why it failed
+        self.failure: OSError | None = None  # why there is nothing more to read, if not because of a FIN
         self._settings, self._context, self._listener = settings, context, listener
         self._modern = settings.protocol == "5"
         protocol = MQTTProtocolVersion.MQTTv5 if self._modern else MQTTProtocolVersion.MQTTv311
@@ -148,7 +149,7 @@ class PahoClient:
         except OSError as failure:
             data, error = b"", failure
         if not data:
-            self.hung_up = is_hang_up(error)
+            self.hung_up, self.failure = is_hang_up(error), error
             self.close()
         # With TLS the number of unpacked bytes does not tell whether the socket has more.
         self.drained = not data or (len(data) < _PIECE and self._context is None)

@@ -21,7 +21,7 @@ from pebble.transports.credentials import Credentials
 from pebble.transports.hosts import Address
 from pebble.transports.mqtt import client_ids, packets, reasons
 from pebble.transports.mqtt.client import Client, Opening
-from pebble.transports.mqtt.ending import WANTS_TLS, unreached
+from pebble.transports.mqtt.ending import WANTS_TLS, alert, unreached
 from pebble.transports.settings import MqttSettings
 
 ANSWER_S = 3.0  # within which a broker answers, and four round trips
@@ -127,6 +127,12 @@ class Peer(packets.Listener):
     @property
     def closed(self) -> bool:
         return self._client.socket is None
+
+    @property
+    def failure(self) -> str:
+        """Return in words why TLS has ended the connection; empty if TLS has not."""
+        failure = self._client.failure
+        return unreached(failure, tls=True) if failure is not None and alert(failure) else ""
 
     @property
     def sock(self) -> socket.socket | None:
@@ -255,7 +261,8 @@ class BrokerTrial:
         self._peers.append(peer)
         self.wait(lambda: peer.code is not None or peer.closed, _MORE_PATIENCE * self.answer_s)
         if peer.code != 0:
-            why = peer.problem or (_HANGS_UP[settings.tls is None] if peer.closed else "it does not answer")
+            silence = _HANGS_UP[settings.tls is None] if peer.closed else "it does not answer"
+            why = peer.problem or peer.failure or silence
             peer.leave()
             raise RefusedError(why, peer.code)
         return peer
