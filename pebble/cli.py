@@ -88,7 +88,7 @@ def _open_missing_streams() -> None:
 
 def _accept_signals() -> None:
     """Let SIGTERM end this program, and its children be waited for, if the caller has blocked or ignored signals."""
-    if sys.platform != "win32":
+    if hasattr(signal, "pthread_sigmask"):  # not on Windows
         signal.pthread_sigmask(signal.SIG_SETMASK, ())
         for number in (signal.SIGTERM, signal.SIGCHLD):
             if signal.getsignal(number) is signal.SIG_IGN:
