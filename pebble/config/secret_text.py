@@ -13,13 +13,39 @@ _VALUE = rf"""(?:(?<=")[^"\n]+(?:"{_REST})?|(?<=')[^'\n]+(?:'{_REST})?|(?<!["'])
 _NEXT = r"""(?:["'],\s*|[= \t][ \t]*)\\?["']?"""  # from an option to its value, on a command line or in a list
 #: A pair of a query, an option or a variable.
 _PAIR = re.compile(rf"""(\b(?:{_NAME}|[\w-]{{0,40}}\bsig(?:nature)?)=\\?["']?){_VALUE}""", re.IGNORECASE)
-#: An option whose name says it, the login of `curl -u`, and options of programs that are often in scripts.
+#: An option whose name says it, and the login of `curl -u`.
 _OPTION = re.compile(
     rf"""((?<![\w-])(?!--no-)--?(?i:{_NAME}){_END}{_NEXT}(?!-)"""
-    rf"""|(?<![\w-])(?:-u|--(?:proxy-)?user)(?:{_NEXT})?(?!\d+:\d+\b)[^\s:"'/=]{{1,64}}:(?!//)"""
-    rf"""|\bmosquitto_[^\n]{{1,400}}?[\s"']-P(?:{_NEXT})?"""
-    rf"""|\b(?:sshpass|mysql|docker login)\b[^\n]{{0,400}}?[\s"']-p(?:{_NEXT})?){_VALUE}"""
+    rf"""|(?<![\w-])(?:-u|--(?:proxy-)?user)(?:["'],\s*["']?|[= \t]*(?:\\["'])?)(?!\d+:\d+\b)"""
+    rf"""[^\s:"'/=]{{1,64}}:(?!//)){_VALUE}"""
 )
+#: The same login in quotes, in which its password may have blanks.
+_QUOTED_LOGIN = re.compile(
+    r"""((?<![\w-])(?:-u|--(?:proxy-)?user)[= \t]*(["'])(?!\d+:\d+\b)[^\s:"'/=]{1,64}:)(?:(?!\2)[^\n])+"""
+)
+#: Programs that are often in scripts, and what stands before a secret on their command lines.
+_PROGRAMS = tuple(
+    (program, re.compile(rf"""({program}[^\n]{{0,400}}?[\s"'.](?:{before})(?:{_NEXT})?){_VALUE}"""))
+    for program, before in (
+        ("mosquitto_", "-P"),
+        ("zip", "-P"),
+        ("sshpass", "-p"),
+        ("mysql", "-p"),
+        ("docker login", "-p"),
+        ("mongo", "-p"),
+        ("7z", "-p"),
+        ("redis-cli", "-a"),
+        ("ldap", "-w"),
+        ("curl", "-b|--cookie|--oauth2-bearer"),
+        ("smbclient", r"""(?:-U|--user)[= ]?["']?[^\s%"']{1,64}%"""),
+        ("nmcli", r"""(?:password|psk)(?=[\s"'])"""),
+        ("iwconfig", r"key(?=\s)"),
+        ("wpa_passphrase", r"""(?:"[^"\n]+"|'[^'\n]+'|[^\s"']+)(?=\s)"""),
+        ("passwd", r"-\w*b\w*(?: [^\s-]\S*){1,2}(?= )"),
+        ("vault", "login(?= [^-])"),
+    )
+)
+_SUDO = re.compile(r"(\becho\s)[^\n|]{1,200}(?=\|\s*sudo\s[^\n|]{0,200}-S\b)")  # it reads a password
 _HEADER = re.compile(
     r"""(\b(?:authorization|cookie|x-[\w-]{0,40}(?:key|auth|token|secret))\\?["']?\s*:\s*\\?["']?)"""
     r"""[^\s\\"'](?:[^\\"'\n]|(?<==)\\?"[^"\n]*")*""",  # a Digest has values in quotes
@@ -55,7 +81,10 @@ def without_secrets(text: str) -> str:
     if _AT.search(text):
         text = re.sub(r"\S+", _without_login, _LOGIN_WITH_BLANKS.sub(rf"\1{HIDDEN}@", text))
     text = _PAIR.sub(rf"\1{HIDDEN}", text) if "=" in text else text  # only if it can match: to save time
-    text = _OPTION.sub(rf"\1{HIDDEN}", text) if "-" in text else text
+    if "-" in text:
+        text = _OPTION.sub(rf"\1{HIDDEN}", _QUOTED_LOGIN.sub(rf"\1{HIDDEN}", text))
+    for program, pattern in (*_PROGRAMS, ("sudo", _SUDO)):
+        text = pattern.sub(rf"\1{HIDDEN}", text) if program in text else text
     text = _HEADER.sub(rf"\1{HIDDEN}", text) if ":" in text else text
     return _MEMBER.sub(rf"\1\2\3\4{HIDDEN}", text) if ":" in text else text  # a match has one of the groups
 
