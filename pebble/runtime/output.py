@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 _UNFOLDED = 10_000  # columns
 _PIECE = 128  # bytes for which a terminal has room if it has any: it has 256 then
 _PIPE_PIECE = getattr(select, "PIPE_BUF", 512)  # bytes that a pipe takes as a whole, if it has room; none on Windows
-_LONGEST = 4096  # bytes of a line, which is then one write to a pipe of Linux
+_LONGEST = 16_384  # bytes of a line, or of a traceback's lines
 
 
 def console() -> Console:

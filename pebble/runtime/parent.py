@@ -20,7 +20,7 @@ ENCODING = "PEBBLE_ENCODING"  # the encoding in the request that started this me
 LAUNCHER_PID = "PEBBLE_LAUNCHER_PID"
 ALIVE_PERIOD_S = 1.0
 _WHY = 200  # characters of a reason
-_PATIENCE_S = 0.25  # for the reader of log lines; a program that floods it has to wait for less
+_PATIENCE_S = 0.25  # for the reader of log lines, such as the launcher; while that stands still, no stop waits for it
 LOG_FORMAT = "%(asctime)s [%(levelname)s] %(message)s"  # what the launcher's log forwarding reads (paper A.8.7)
 TAG = re.compile(r"\[([^\]]+) (\d+)\] (.*)", re.DOTALL)  # of a line by ``tagged``
 _PR_SET_PDEATHSIG = 1
@@ -31,25 +31,11 @@ log = logging.getLogger(__name__)
 def set_up_logging(level: str) -> None:
     """Write log lines to stderr in the format that the launcher forwards; drop them while it has no room for them."""
     if not logging.getLogger().handlers:
-        handler = _LineHandler()
+        handler = logging.StreamHandler(NonBlockingWriter(sys.stderr.fileno(), _PATIENCE_S))
+        handler.terminator = ""  # the writer adds it
         handler.setFormatter(MaskingFormatter(LOG_FORMAT, "%H:%M:%S"))
         logging.getLogger().addHandler(handler)
         set_log_level(level)
-
-
-class _LineHandler(logging.Handler):
-    """A handler that drops lines if the reader of stderr, such as the launcher, stands still: a stop would wait."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._writer = NonBlockingWriter(sys.stderr.fileno(), _PATIENCE_S)
-
-    def emit(self, record: logging.LogRecord) -> None:
-        try:
-            for line in self.format(record).splitlines():
-                self._writer.write(line)
-        except Exception:  # noqa: BLE001 - as every handler of logging
-            self.handleError(record)
 
 
 class MaskingFormatter(logging.Formatter):
