@@ -5,14 +5,16 @@ import re
 HIDDEN = "***"
 _NAMES = "pass|secret|token|credential|(?:api|access|private|auth).?key"
 _KEY = re.compile(_NAMES, re.IGNORECASE).search
-_NAME = rf"[\w-]{{0,40}}(?:{_NAMES}|pwd)[\w-]{{0,40}}"
+_NAME = rf"[\w-]{{0,40}}(?:{_NAMES}|pwd|psk|jwt)[\w-]{{0,40}}"
 _END = r"(?<![_-]file)(?<![_-]env)"  # of a name; what is in a file or a variable stays there
 _REST = r"""(?=["'\w\\])[^&\s]*"""  # a shell goes on with the same word after a closing quote
 #: In quotes it may have blanks.
 _VALUE = rf"""(?:(?<=")[^"\n]+(?:"{_REST})?|(?<=')[^'\n]+(?:'{_REST})?|(?<!["'])[^&\s]+)"""
 _NEXT = r"""(?:["'],\s*|[= \t][ \t]*)\\?["']?"""  # from an option to its value, on a command line or in a list
 #: A pair of a query, an option or a variable.
-_PAIR = re.compile(rf"""(\b(?:{_NAME}|[\w-]{{0,40}}\bsig(?:nature)?)=\\?["']?){_VALUE}""", re.IGNORECASE)
+_PAIR = re.compile(
+    rf"""((?:\b(?:{_NAME}|[\w-]{{0,40}}\bsig(?:nature)?)|[?&](?:key|code|auth))=\\?["']?){_VALUE}""", re.IGNORECASE
+)
 #: An option whose name says it, and the login of `curl -u`.
 _OPTION = re.compile(
     rf"""((?<![\w-])(?!--no-)--?(?i:{_NAME}){_END}{_NEXT}(?!-)"""

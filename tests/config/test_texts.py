@@ -134,6 +134,7 @@ def test_a_secret_on_a_command_line_is_not_printed_again(run: Run) -> None:
         (f"mqtt://a:{SECRET}@b:1", "mqtt://***@b:1"),
         (f"x?token={SECRET}&y=1", "x?token=***&y=1"),
         (f"x?X-Sig={SECRET}&design=1", "x?X-Sig=***&design=1"),
+        (f"x?key={SECRET}&code={SECRET} psk={SECRET}", "x?key=***&code=*** psk=***"),
         (f'{{"api_key": "{SECRET}", "x": 1}}', '{"api_key": "***", "x": 1}'),
         (f'{{"password" : "{SECRET}"}}', '{"password" : "***"}'),
         (f"{{'mqtt_password': '{SECRET}', 'port': 1}}", "{'mqtt_password': '***', 'port': 1}"),

@@ -10,6 +10,7 @@ from pebble.errors import PebbleError
 from pebble.extensions.calibrate.wheels import Person
 from pebble.extensions.scripts.perception.camera_model import Floats
 from pebble.extensions.scripts.perception.tags import Tag, TagFinder, largest
+from pebble.runtime.as_owner import as_owner
 from pebble.runtime.whole_file import write
 
 LEAST_PICTURES = 15
@@ -119,7 +120,8 @@ def save(path: Path, lens: Lens, tag_id: int, size_m: float, family: str) -> Non
     }
     for key, value in values.items():
         file.write(key, value)
-    write(path, file.releaseAndGetString().encode(), 0o644, PebbleError)
+    with as_owner(path.parent):
+        write(path, file.releaseAndGetString().encode(), 0o644, PebbleError)
 
 
 def read_folder(folder: Path) -> Iterator[Any]:

@@ -15,6 +15,7 @@ from pebble.extensions.scripts.perception.camera_model import CameraModel
 from pebble.extensions.scripts.perception.odometry import CALIBRATION, Calibration, OdometrySettings
 from pebble.extensions.scripts.perception.tags import FAMILY, Place, TagFinder
 from pebble.extensions.scripts.script import Robot
+from pebble.runtime.as_owner import as_owner
 from pebble.runtime.whole_file import write
 
 LEAST_STRAIGHTS, LEAST_SPINS = 4, 2
@@ -60,8 +61,9 @@ def calibrate(robot: Robot, person: Person, wanted: Wanted, clock: Callable[[], 
     """Drive all runs, fit the wheels, and write ``odometry.json`` beside the config. Raises PebbleError, Stopped."""
     check(wanted)
     path = robot.config.folder / CALIBRATION
-    write(path.with_suffix(".try"), b"", 0o644, PebbleError)  # raises before the runs if nothing can be written there
-    path.with_suffix(".try").unlink()
+    with as_owner(path.parent):
+        write(path.with_suffix(".try"), b"", 0o644, PebbleError)  # raises before the runs if nothing can be written
+        path.with_suffix(".try").unlink()
     session = _Session(robot, person, wanted, clock)
     result = session.run()
     calibration = Calibration(
@@ -73,7 +75,8 @@ def calibrate(robot: Robot, person: Person, wanted: Wanted, clock: Callable[[], 
         runs=len(session.runs),
         residual_mm=round(result.residual_mm, 2),
     )
-    write(path, json.format(json.encode(calibration), indent=2) + b"\n", 0o644, PebbleError)
+    with as_owner(path.parent):
+        write(path, json.format(json.encode(calibration), indent=2) + b"\n", 0o644, PebbleError)
     return calibration
 
 
