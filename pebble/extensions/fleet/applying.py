@@ -14,6 +14,7 @@ from typing import Any
 
 from msgspec.structs import replace
 
+from pebble.config.text_files import NotTextError, text_of
 from pebble.extensions.fleet import broker_files, certificates
 from pebble.extensions.fleet.folder import ACL, CONF, PASSWORDS, PID, ZENOH, Fleet, FleetError, Server, save
 from pebble.ownership import read_plain
@@ -61,16 +62,23 @@ def conf_differences(folder: Path, fleet: Fleet) -> Iterator[str]:
     A line too many may open another listener, or may have a reason, so no command removes it.
     """
     file = folder / CONF
-    try:
-        lines = read_plain(file).decode().splitlines()
-    except OSError as error:
-        raise FleetError(f"{file}: {error.strerror}") from None
+    lines = _text(file).splitlines()
     user = next((line.split()[1] for line in lines if line.startswith("user ")), "")
     wanted = broker_files.conf_text(fleet, folder, user).splitlines()
     too_many = (line for line in lines if line.strip() and line not in wanted)
     yield from (f"{file}: has a line of its own: {line}: remove it there, then restart mosquitto" for line in too_many)
     lacking = (line for line in wanted if line not in lines)
     yield from (f"{file}: is without the line: {line}: add it there, then restart mosquitto" for line in lacking)
+
+
+def _text(file: Path) -> str:
+    """Return the text of a file of the folder. Raises FleetError."""
+    try:
+        return text_of(read_plain(file))
+    except OSError as error:
+        raise FleetError(f"{file}: {error.strerror}") from None
+    except NotTextError as error:
+        raise FleetError(f"{file} {error}") from None
 
 
 def apply(folder: Path, fleet: Fleet, passwords: Mapping[str, str] | None = None) -> str:
@@ -137,10 +145,9 @@ def _is_broker(pid: int) -> bool:
 def obeys_plugin(folder: Path) -> bool:
     """True if mosquitto uses the dynamic-security plugin, by its configuration or in the running process."""
     pid = pid_of(folder)
-    with suppress(FileNotFoundError):
-        lines = read_plain(folder / CONF).decode().splitlines()
-        if any(line.startswith("plugin ") and _PLUGIN in line for line in lines):
-            return True
+    lines = _text(folder / CONF).splitlines() if (folder / CONF).exists() else []
+    if any(line.startswith("plugin ") and _PLUGIN in line for line in lines):
+        return True
     # If mosquitto runs as another user, only root can read this. Then only root can make it reload its files, too.
     with suppress(OSError), as_before():  # as root again, if this command began as root
         return _PLUGIN in Path(f"/proc/{pid}/maps").read_text(encoding="utf-8")
@@ -151,9 +158,7 @@ def passwords_of(folder: Path) -> dict[str, broker_files.Hashed]:
     """Return the hashed passwords in the broker's file, by account. Raises FleetError."""
     file = folder / PASSWORDS
     try:
-        return broker_files.passwords_in(read_plain(file).decode())
-    except OSError as error:
-        raise FleetError(f"{file}: {error.strerror}") from None
+        return broker_files.passwords_in(_text(file))
     except ValueError:
         raise FleetError(f"{file} cannot be read: restore it from a copy, or make a new fleet") from None
 
@@ -226,10 +231,7 @@ def _certificates(folder: Path, fleet: Fleet) -> Iterator[str]:
 
 
 def _of_acl(folder: Path, fleet: Fleet) -> Iterator[str]:
-    try:
-        present_rules = dict.fromkeys(broker_files.rules_in(read_plain(folder / ACL).decode()))
-    except OSError as error:
-        raise FleetError(f"{error.filename}: {error.strerror}") from None
+    present_rules = dict.fromkeys(broker_files.rules_in(_text(folder / ACL)))
     wanted = dict.fromkeys(broker_files.rules_in(broker_files.acl_text(fleet)))
     yield from (f"one rule too many: {rule}" for rule in present_rules if rule not in wanted)
     yield from (f"one rule too few: {rule}" for rule in wanted if rule not in present_rules)

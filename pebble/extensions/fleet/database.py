@@ -3,6 +3,7 @@
 import errno
 import os
 import sqlite3
+import stat
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -104,11 +105,19 @@ class Database:
         self._connection.close()
 
 
+def require_plain(database: Path) -> None:
+    """Raise OSError if a file of a database is a FIFO, for which SQLite would wait for ever, a device or a folder."""
+    for file in (database.with_name(f"{database.name}{end}") for end in ("", "-journal", "-wal", "-shm")):
+        # Not opened: when a process closes a file, it loses the locks of all its connections.
+        with suppress(FileNotFoundError):
+            if not stat.S_ISREG(file.stat().st_mode):
+                raise OSError(errno.EINVAL, f"{file.name} is no plain file", str(file))
+
+
 def _connection(path: Path | None, tables: str) -> sqlite3.Connection:
     """Open the file, which exists already, and create missing tables. Raises OSError and sqlite3.Error."""
     if path is not None:
-        if path.is_dir():
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+        require_plain(path)
         set_mode(path, 0o600)
     where = ":memory:" if path is None else str(path)
     connection = sqlite3.connect(where, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)

@@ -17,7 +17,7 @@ from unicodedata import normalize
 
 from pebble.contract.names import NAME
 from pebble.errors import PebbleError
-from pebble.extensions.fleet.database import Database, DatabaseError
+from pebble.extensions.fleet.database import Database, DatabaseError, require_plain
 from pebble.extensions.fleet.roles import Role, Session
 from pebble.extensions.fleet.tries import Tries, network_of
 from pebble.runtime.as_owner import as_owner
@@ -252,7 +252,8 @@ def has_user(path: Path | None, name: str = "") -> bool:
 
 
 def _has_user(path: Path, name: str) -> bool:
-    """True if the file has this person; with the name "", if it has any person."""
+    """True if the file has this person; with the name "", if it has any person. Raises OSError."""
+    require_plain(path)
     # Nothing is written: ``immutable`` keeps SQLite from making its shared-memory file. Beside a write-ahead log, which
     # has to be read, that file is there already.
     unchanged = "" if path.with_name(f"{path.name}-wal").exists() else "&immutable=1"

@@ -179,6 +179,15 @@ def test_it_finds_changes_of_files(tmp_path: Path, file: str, old: str, new: str
     assert all(line.endswith("then restart mosquitto") for line in by_hand)
 
 
+@pytest.mark.parametrize("file", [CONF, ACL, PASSWORDS])
+def test_a_file_that_is_no_text_is_named(tmp_path: Path, file: str) -> None:
+    broker = FleetBroker(tmp_path / "hall", {"otto": DRIVER, "goob": GOOB})
+    for damage in (lambda path: path.write_bytes(b"\xff"), lambda path: (path.unlink(), os.mkfifo(path))):
+        damage(broker.folder / file)
+        with pytest.raises(FleetError, match=f"{file}:? is n"):
+            (applying.apply if file == CONF else applying.of_rules)(broker.folder, broker.fleet)
+
+
 # -- a fleet of the last version
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import sqlite3
 import stat
 import time
@@ -247,6 +248,18 @@ def test_a_file_that_is_no_database(tmp_path: Path) -> None:
         People(file)
     with pytest.raises(PebbleError, match="below: cannot be used"):
         People(file / "below")
+
+
+@pytest.mark.parametrize("name", ["people.sqlite", "people.sqlite-journal", "people.sqlite-wal", "people.sqlite-shm"])
+def test_a_pipe_in_place_of_a_file_of_the_database_holds_up_nobody(tmp_path: Path, name: str) -> None:
+    file = tmp_path / "people.sqlite"
+    with closing(People(file)):
+        pass
+    (tmp_path / name).unlink(missing_ok=True)
+    os.mkfifo(tmp_path / name)
+    for opens in (People, has_user):
+        with pytest.raises(PebbleError, match=f"{name} is no plain file"):
+            opens(file)
 
 
 def test_a_file_that_is_gone_or_replaced_costs_nothing_until_the_next_start(

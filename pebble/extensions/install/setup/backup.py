@@ -23,6 +23,7 @@ import msgspec
 from pebble.config import Config, load
 from pebble.config.masking import values_of
 from pebble.errors import PebbleError
+from pebble.extensions.fleet.database import require_plain
 from pebble.extensions.fleet.folder import FLEET
 from pebble.extensions.operator.places import Places
 from pebble.extensions.page.setting import people_of
@@ -96,16 +97,17 @@ def make(places: Places) -> Backup:
     backup = Backup(About(format=FORMAT, version=__version__, id=config.robot.id, note=NOTE))
     files = dict.fromkeys(_files(places, config))
     plain = {file.resolve() for file in files if not file.is_symlink()}
+    room = _MOST
     for file in files:
         if file.is_symlink() and file.resolve() in plain:
             continue  # setup makes such a link again
         with as_owner(file.parent):
-            _add(backup, places.root, file)
+            room -= _add(backup, places.root, file)
+        if room < 0:  # before more is read: the robot needs its memory
+            raise BackupError(f"it would have more than {_MOST / 1e9:.1f} GB: is there something below {places.state}?")
     for what, folder in _left_out(config):
         if (place := _here(places, folder)).exists():
             backup.left_out[str(place)] = what
-    if backup.bytes > _MOST:
-        raise BackupError(f"it would have {backup.bytes / 1e9:.1f} GB: is there something below {places.state}?")
     return backup
 
 
@@ -149,21 +151,22 @@ def _below(place: Path, without: Iterable[Path]) -> Iterator[Path]:
             yield path
 
 
-def _add(backup: Backup, root: Path, file: Path) -> None:
-    """Add a file as it is at one moment."""
+def _add(backup: Backup, root: Path, file: Path) -> int:
+    """Add a file as it is at one moment, and return its size; 0 if it is left out."""
     name = str(file.relative_to(root))
     if name.endswith(_NEVER_SAVED):
-        return
+        return 0
     try:
         if (size := file.stat().st_size) > _LARGEST:
             backup.left_out[str(file)] = f"{size / 1e6:.0f} MB are too large"
-            return
+            return 0
         content = read_plain(file)
         if content.startswith(_SQLITE):  # these bytes may be of several moments
             content = _database(file)
         backup.files[name] = Saved(content, file.stat().st_mode & 0o777)
+        return len(content)
     except FileNotFoundError:  # removed meanwhile
-        return
+        return 0
     except OSError as error:
         raise BackupError(
             f"{file}: cannot be read: {error.strerror}; run it as root, or remove it if it is a link"
@@ -171,7 +174,8 @@ def _add(backup: Backup, root: Path, file: Path) -> None:
 
 
 def _database(file: Path) -> bytes:
-    """Return a consistent copy of a database, by SQLite's backup. Raises BackupError if it is damaged."""
+    """Return a consistent copy of a database, by SQLite's backup. Raises BackupError if it is damaged, or OSError."""
+    require_plain(file)
     try:
         with (
             closing(sqlite3.connect(f"file:{file}?mode=ro", uri=True)) as original,

@@ -24,6 +24,7 @@ from pebble.extensions.fleet import certificates
 from pebble.extensions.fleet.certificates import CA_CERT
 from pebble.extensions.fleet.people import People
 from pebble.extensions.fleet.roles import Account
+from pebble.extensions.install.setup import backup as backups
 from pebble.extensions.install.setup.backup import ABOUT, BackupError, Saved, make, packed, read, unpacked
 from pebble.extensions.operator.places import Places, mosquitto_path
 from pebble.runtime.connections import mqtt_settings
@@ -298,6 +299,17 @@ def test_all_files_but_recordings_are_in_it_as_they_are(places: Places, tmp_path
         assert people.check("ann", PAGE, "10.0.0.1"), "though it is open, with changes in its journal"
     for name, saved in files.items():
         assert (saved.content, saved.mode) == (there[name].read_bytes(), stat.S_IMODE(there[name].stat().st_mode)), name
+
+
+def test_one_that_is_too_large_is_given_up_before_the_machine_has_no_memory(
+    places: Places, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read = list[Path]()
+    monkeypatch.setattr(backups, "_MOST", 100)
+    monkeypatch.setattr(backups, "read_plain", lambda file: read.append(file) or bytes(60))
+    with pytest.raises(BackupError, match="would have more than"):
+        make(places)
+    assert len(read) == 2
 
 
 def test_the_command(places: Places, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
