@@ -9,8 +9,8 @@ import platform
 import struct
 
 CALLS = {
-    "x86_64": {"pidfd_open": 434, "eventfd2": 290, "prctl": 157},
-    "aarch64": {"pidfd_open": 434, "eventfd2": 19, "prctl": 167},
+    "x86_64": {"pidfd_open": 434, "eventfd2": 290, "prctl": 157, "setpgid": 109},
+    "aarch64": {"pidfd_open": 434, "eventfd2": 19, "prctl": 167, "setpgid": 154},
 }.get(platform.machine(), {})
 
 _SET_NO_NEW_PRIVS, _SET_SECCOMP, _FILTER = 38, 22, 2

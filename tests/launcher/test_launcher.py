@@ -77,6 +77,7 @@ def test_a_killed_child_is_started_again_at_once_with_the_config_of_its_launcher
         ("pidfd_open", "ENOSYS", ["pidfd_open is denied here (Function not implemented)"]),
         ("eventfd2", "EPERM", []),
         ("prctl", "EPERM", []),  # then nothing ends with a launcher that is killed
+        ("setpgid", "EPERM", []),
     ],
 )
 def test_a_robot_runs_where_a_system_call_is_denied(launch: Launch, call: str, error: str, named: list[str]) -> None:

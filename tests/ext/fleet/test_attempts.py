@@ -1,4 +1,4 @@
-"""What each account gets through at a real mosquitto, at both levels, with and without TLS. Expected by hand."""
+"""The topics that each account gets through at a real mosquitto, at both levels, with and without TLS. Expected by hand."""
 
 from __future__ import annotations
 
@@ -320,7 +320,7 @@ def test_the_table_of_the_documentation_is_what_the_brokers_do() -> None:
 
 
 def _cell(what: str, name: str) -> str:
-    """One word, which is true for each topic of the row."""
+    """Return the word that is true for each topic of the row."""
     answers = []
     for level in LEVELS:
         by = f"by/{name}/" if level == "named" else ""

@@ -1,4 +1,4 @@
-"""What only Debian's own ROS can show: its bytes, and nodes of roscpp."""
+"""The bytes of Debian's own ROS, and nodes of roscpp."""
 
 from __future__ import annotations
 
