@@ -1,4 +1,4 @@
-"""The topics that each account gets through at a real mosquitto, at both levels, with and without TLS. Expected by hand."""
+"""The topics that each account gets through at a real mosquitto, at both levels, with and without TLS, by hand."""
 
 from __future__ import annotations
 

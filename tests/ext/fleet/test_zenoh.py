@@ -1,4 +1,4 @@
-"""The topics that each account gets through at a Zenoh hub, which knows it by its certificate: the same as at a broker.
+"""The topics that each account gets through at a Zenoh hub, which knows it by its certificate: as at a broker.
 
 The hub and all clients are processes of their own, with TLS; expected by hand, as in test_attempts. Then what a hub
 takes from an account of another machine, and what a neighbour's account may do there.
